@@ -1,0 +1,20 @@
+# make demo   train a walking Go1 on this CPU, evaluate it, write pictures
+# make test   everything CI runs but the smoke run of the script
+PYTHON ?= python3
+BIN = .venv/bin
+
+.PHONY: demo test
+
+demo: .venv/installed
+	$(BIN)/python ppo_finetune.py --task go1_loco --preset cpu --run-dir runs/demo --force
+	$(BIN)/python ppo_finetune.py --task go1_loco --eval runs/demo/policy.msgpack
+
+test: .venv/installed
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	JAX_PLATFORMS=cpu $(BIN)/python -m pytest -q tests
+
+.venv/installed: requirements.txt
+	$(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install -q -r requirements.txt
+	touch $@

@@ -1,0 +1,21 @@
+"""Robot tasks. `envs.make("go1_loco")` is all a script needs; `envs.TASKS` lists the names."""
+
+from envs import locomotion
+from envs.base import replace_checked
+
+TASKS = {
+    "anymal_loco": (locomotion.AnymalLocomotion, locomotion.ANYMAL_LOCO),
+    "go1_loco": (locomotion.Locomotion, locomotion.GO1_LOCO),
+    "g1_loco": (locomotion.G1Locomotion, locomotion.G1_LOCO),
+}
+
+
+def make(task, engine="auto", **overrides):
+    """Build a task's environment; overrides replace fields of its config, e.g. make("go1_loco", noise=0.0).
+
+    ValueError for a task, engine or field that does not exist, naming those that do.
+    """
+    if task not in TASKS:
+        raise ValueError(f"unknown task {task!r}; choose one of {', '.join(TASKS)}")
+    family, config = TASKS[task]
+    return family(replace_checked(config, overrides), engine)

@@ -1,0 +1,429 @@
+"""What every task shares: the State, one control step, noise, history, randomisation, automatic reset, mirrors.
+
+`env.reset(key) -> State` and `env.step(state, action) -> State` are pure functions of one environment; scripts vmap
+them. A task family subclasses `Env` and says what it observes, rewards and terminates (see locomotion.py).
+Legend: A joints and actions, F feet, O observation, X proprioception x_t (6 + 2A), K history length.
+"""
+
+import dataclasses
+from dataclasses import dataclass
+
+import flax
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from envs import terrain
+from envs.engine import Physics, make_engine
+from envs.robots import AXIAL, POLAR, ROBOTS
+
+
+@dataclass(frozen=True)
+class Config:
+    """Numbers of a task. Weights are per second, ranges are (low, high)."""
+
+    robot: str
+    weights: dict[str, float]  # reward term -> weight
+    ppo: dict  # the task's own PPO settings; see ppo_finetune.py
+    episode_seconds: float = 20.0
+    physics_dt: float = 0.005  # [s]
+    decimation: int = 4  # physics steps per control step
+    history: int = 5  # K
+    noise: float = 1.0  # multiplies the sensor noise of NOISE
+    reward_floor: float = -0.5  # per second, on the sum of all terms but termination
+    termination_reward: float = 0.0  # once, when an episode ends by failure
+    # start of an episode
+    spawn_xy: float = 0.5  # [m] half-width around the origin
+    spawn_yaw: float = np.pi  # [rad] half-width around forward
+    spawn_joints: tuple[float, float] = (1.0, 1.0)  # factor on the default pose
+    spawn_velocity: float = 0.0  # half-width of all six base velocities [m/s, rad/s]
+    # randomisation, drawn once an episode
+    friction: tuple[float, float] = (0.7, 0.7)
+    added_mass: tuple[float, float] = (0.0, 0.0)  # [kg] on the base
+    push_velocity: float = 0.0  # [m/s] half-width of a sudden change of horizontal velocity
+    push_seconds: tuple[float, float] = (10.0, 15.0)  # time between pushes
+
+
+# Half-width of uniform sensor noise (tasks of Isaac Lab); commands and the last action are exact.
+NOISE = {"lin_vel": 0.1, "ang_vel": 0.2, "gravity": 0.05, "joint_pos": 0.01, "joint_vel": 1.5}
+PROP = {"ang_vel": "axial", "gravity": "polar", "joint_pos": "joint", "joint_vel": "joint"}  # x_t, in order
+BLOWN_UP = 1e3  # [m, m/s, rad/s] no sound simulation gets here
+
+
+@flax.struct.dataclass
+class State:
+    """One environment. `obs` is what follows an automatic reset, `final_obs` what stood before it."""
+
+    physics: Physics
+    obs: jax.Array  # (O,) scaled, noisy
+    history: dict  # prop (K+1, X) in SI units, action (K, A); oldest first, as the robot logged them
+    reward: jax.Array  # ()
+    terminated: jax.Array  # () bool: failure, nothing follows
+    truncated: jax.Array  # () bool: time limit, V(final_obs) follows
+    final_obs: jax.Array  # (O,)
+    final_history: dict
+    action: jax.Array  # (A,) the last one
+    clock: jax.Array  # () control steps since the episode began
+    push_at: jax.Array  # () clock of the next push
+    episode_return: jax.Array  # () sum of rewards, before the reset
+    key: jax.Array
+    task: flax.struct.PyTreeNode  # the task family's own state
+    metrics: dict  # name -> (), of this step
+
+
+@flax.struct.dataclass
+class Motion:
+    """True kinematics, computed from qpos and qvel; forces and feet from the engine's sensors."""
+
+    lin_vel: jax.Array  # (3,) base velocity, base frame [m/s]
+    ang_vel: jax.Array  # (3,) base frame [rad/s]
+    gravity: jax.Array  # (3,) unit vector, base frame
+    joint_pos: jax.Array  # (A,) minus the default pose [rad]
+    joint_vel: jax.Array  # (A,)
+    joint_acc: jax.Array  # (A,)
+    torque: jax.Array  # (A,) [N m]
+    quat: jax.Array  # (4,) base orientation
+    yaw: jax.Array  # () [rad]
+    foot_pos: jax.Array  # (F, 3) world
+    foot_vel: jax.Array  # (F, 3) world
+    foot_contact: jax.Array  # (F,) bool, more than 1 N
+    sensors: jax.Array  # (S,) all readings, for the contact forces of other bodies
+
+
+def rotate(quat, vec):
+    """Vector(s) (..., 3) from the body frame of quat (..., 4) wxyz to its parent frame."""
+    w, u = quat[..., :1], quat[..., 1:]
+    return vec + 2 * jnp.cross(u, jnp.cross(u, vec) + w * vec)
+
+
+def multiply(p, q):
+    """Hamilton product of quaternions (..., 4) wxyz."""
+    pw, pv, qw, qv = p[..., :1], p[..., 1:], q[..., :1], q[..., 1:]
+    real = pw * qw - jnp.sum(pv * qv, -1, keepdims=True)
+    return jnp.concatenate([real, pw * qv + qw * pv + jnp.cross(pv, qv)], -1)
+
+
+def axis_angle(axis, angle):
+    """Quaternion (..., 4) of a turn by angle (...) about unit axis (..., 3)."""
+    half = angle[..., None] / 2
+    return jnp.concatenate([jnp.cos(half), jnp.sin(half) * axis], -1)
+
+
+def inverse(quat):
+    """Conjugate of unit quaternions (..., 4)."""
+    return quat * jnp.array([1.0, -1, -1, -1])
+
+
+def yaw_of(quat):
+    """Heading [rad] of a base orientation."""
+    w, x, y, z = quat
+    return jnp.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+
+
+def wrap(angle):
+    """Angle in [-pi, pi)."""
+    return (angle + jnp.pi) % (2 * jnp.pi) - jnp.pi
+
+
+def uniform(key, low, high, shape=()):
+    """Uniform sample in [low, high)."""
+    return jax.random.uniform(key, shape, minval=low, maxval=high)
+
+
+def select(condition, yes, no):
+    """Leaf-wise where over two pytrees of the same structure."""
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)
+
+
+class Env:
+    """One robot task. Subclasses define OBS and the methods below `# --- task ---`."""
+
+    # observation block -> (mirror kind, fixed scale); order is the order of the vector
+    OBS: dict[str, tuple] = {}
+    bootstrap_time_outs = True  # V(final_obs) follows a time limit; not where the policy sees the time left
+    SHOWCASE: dict = {}  # config fields for the pictures of a trained policy
+
+    def __init__(self, config, engine="auto"):
+        self.config, self.robot = config, ROBOTS[config.robot]
+        spec = self.scene()
+        spec.option.timestep = config.physics_dt
+        self.engine = make_engine(engine, spec, config.decimation)
+        self.model = self.engine.model
+        self.dt = config.physics_dt * config.decimation  # [s] control step
+        self.episode_steps = round(config.episode_seconds / self.dt)
+        self.action_dim = len(self.robot.joints)
+        self.default_pose = jnp.array(self.robot.default_pose)
+        self.sensors = {
+            kind: self.engine.sensor(*(f"{foot}_{kind}" for foot in self.robot.feet))
+            for kind in ("pos", "vel", "force")
+        }
+        self.legs = self.leg_chains()
+        self.mirrors = {mirror: self.mirror_tables(mirror) for mirror in self.robot.mirrors}
+        self.prop_dim = sum(self.width(kind) for kind in PROP.values())
+        self.obs_dim = sum(self.width(kind) for kind, _ in self.OBS.values())
+
+    # --- task ---
+
+    def scene(self, visual=False):
+        """MjSpec of the robot and its ground."""
+        return terrain.flat_scene(self.robot, visual)
+
+    def init_task(self, key, physics):
+        """The task's own state at the start of an episode."""
+        raise NotImplementedError
+
+    def track(self, task, motion):
+        """Bring the task state up to this step's motion, before rewards (contact clocks)."""
+        return task
+
+    def rewards(self, task, motion, action, last_action):
+        """Reward terms by name, unweighted, per second; those without a weight are ignored."""
+        raise NotImplementedError
+
+    def failed(self, task, motion):
+        """Whether the episode ends in failure."""
+        raise NotImplementedError
+
+    def advance(self, key, task, motion, clock):
+        """Task state for the next step (commands), after rewards."""
+        return task
+
+    def task_metrics(self, task, motion):
+        """Numbers to log, by name."""
+        return {}
+
+    # --- shared ---
+
+    def reset(self, key, clock=0):
+        """Start an episode. `clock` (steps) lets a first episode start midway, so that time-outs spread out."""
+        k_spawn, k_task, k_sense, k_push, key = jax.random.split(key, 5)
+        physics = self.spawn(k_spawn)
+        task = self.init_task(k_task, physics)
+        action, clock = jnp.zeros(self.action_dim), jnp.asarray(clock, jnp.int32)
+        sensed, prop = self.sense(k_sense, self.motion(physics))
+        obs = self.observe(sensed, task, action)
+        history = {
+            "prop": jnp.tile(prop, (self.config.history + 1, 1)),
+            "action": jnp.zeros((self.config.history, self.action_dim)),
+        }
+        no, zero = jnp.zeros((), bool), jnp.zeros(())
+        return State(
+            physics=physics,
+            obs=obs,
+            history=history,
+            reward=zero,
+            terminated=no,
+            truncated=no,
+            final_obs=obs,
+            final_history=history,
+            action=action,
+            clock=clock,
+            push_at=clock + self.push_interval(k_push),
+            episode_return=zero,
+            key=key,
+            task=task,
+            metrics=self.metrics(no, {name: zero for name in self.config.weights}, task, self.motion(physics)),
+        )
+
+    def step(self, state, action):
+        """One control step of 20 ms, with automatic reset. action (A,)."""
+        key, k_sense, k_task, k_push, k_reset = jax.random.split(state.key, 5)
+        physics = self.engine.step(state.physics, self.default_pose + self.robot.action_scale * action)
+        healthy = jnp.all(jnp.abs(physics.qpos) < BLOWN_UP) & jnp.all(jnp.abs(physics.qvel) < BLOWN_UP)  # false for NaN
+        physics = select(healthy, physics, state.physics)  # a diverged robot must not poison the batch
+
+        # rewards and termination, on the true state
+        motion = self.motion(physics)
+        task = self.track(state.task, motion)
+        terms = self.rewards(task, motion, action, state.action)
+        terms = {
+            name: jnp.asarray(weight * terms[name] * self.dt, jnp.float32)
+            for name, weight in self.config.weights.items()
+        }
+        terminated = self.failed(task, motion) | ~healthy
+        reward = jnp.maximum(sum(terms.values()), self.config.reward_floor * self.dt)
+        reward += self.config.termination_reward * terminated
+        clock = state.clock + 1
+        truncated = (clock >= self.episode_steps) & ~terminated
+        metrics = self.metrics(~healthy, terms, task, motion)
+
+        # what the robot sees next
+        physics, push_at = self.push(k_push, physics, clock, state.push_at)
+        motion = self.motion(physics)
+        task = self.advance(k_task, task, motion, clock)
+        sensed, prop = self.sense(k_sense, motion)
+        stepped = state.replace(
+            physics=physics,
+            obs=self.observe(sensed, task, action),
+            history={
+                "prop": jnp.concatenate([state.history["prop"][1:], prop[None]]),
+                "action": jnp.concatenate([state.history["action"], action[None]])[1:],
+            },
+            action=action,
+            clock=clock,
+            push_at=push_at,
+            episode_return=state.episode_return + reward,
+            key=key,
+            task=task,
+        )
+        fresh = self.reset(k_reset)
+        return select(terminated | truncated, fresh, stepped).replace(
+            reward=reward,
+            terminated=terminated,
+            truncated=truncated,
+            final_obs=stepped.obs,
+            final_history=stepped.history,
+            metrics=metrics
+            | {"episode_return": stepped.episode_return, "episode_seconds": clock.astype(jnp.float32) * self.dt},
+        )
+
+    def metrics(self, diverged, terms, task, motion):
+        """What one step reports: weighted reward terms, the task's metrics, divergence, the finished episode."""
+        report = {f"reward/{name}": value for name, value in terms.items()} | self.task_metrics(task, motion)
+        return report | {"diverged": diverged, "episode_return": jnp.zeros(()), "episode_seconds": jnp.zeros(())}
+
+    def spawn(self, key):
+        """Physics at the start of an episode: default pose, random place and heading, feet on the ground."""
+        c, m = self.config, self.model
+        k_xy, k_yaw, k_joint, k_vel, k_friction, k_mass = jax.random.split(key, 6)
+        joints = self.default_pose * uniform(k_joint, *c.spawn_joints, (self.action_dim,))
+        low, high = m.jnt_range[1:].T
+        joints = jnp.clip(joints, low, high)
+        height = self.robot.sole - jnp.min(self.feet_in_base(joints)[:, 2])
+        quat = axis_angle(jnp.array([0.0, 0, 1]), uniform(k_yaw, -c.spawn_yaw, c.spawn_yaw))
+        xy = uniform(k_xy, -c.spawn_xy, c.spawn_xy, (2,))
+        qpos = jnp.concatenate([xy, height[None], quat, joints])
+        base_vel = uniform(k_vel, -c.spawn_velocity, c.spawn_velocity, (6,))
+        qvel = jnp.concatenate([base_vel, jnp.zeros(self.action_dim)])
+        base = 1  # the first body after the world
+        added = uniform(k_mass, *c.added_mass)
+        mass_scale = jnp.ones(m.nbody).at[base].add(added / m.body_mass[base])
+        return self.engine.initial(qpos, qvel, uniform(k_friction, *c.friction), mass_scale)
+
+    def push_interval(self, key):
+        """Control steps until the next push."""
+        return jnp.round(uniform(key, *self.config.push_seconds) / self.dt).astype(jnp.int32)
+
+    def push(self, key, physics, clock, push_at):
+        """Change the horizontal base velocity at once, when it is time."""
+        k_vel, k_next = jax.random.split(key)
+        now = clock >= push_at
+        kick = uniform(k_vel, -self.config.push_velocity, self.config.push_velocity, (2,)) * now
+        push_at = jnp.where(now, clock + self.push_interval(k_next), push_at)
+        return physics.replace(qvel=physics.qvel.at[:2].add(kick)), push_at
+
+    def motion(self, physics):
+        """True kinematics of a simulation."""
+        quat = physics.qpos[3:7]
+        down = inverse(quat)
+        force = physics.sensors[self.sensors["force"]]
+        return Motion(
+            lin_vel=rotate(down, physics.qvel[:3]),
+            ang_vel=physics.qvel[3:6],
+            gravity=rotate(down, jnp.array([0.0, 0, -1])),
+            joint_pos=physics.qpos[7:] - self.default_pose,
+            joint_vel=physics.qvel[6:],
+            joint_acc=physics.qacc[6:],
+            torque=physics.torque,
+            quat=quat,
+            yaw=yaw_of(quat),
+            foot_pos=physics.sensors[self.sensors["pos"]],
+            foot_vel=physics.sensors[self.sensors["vel"]],
+            foot_contact=jnp.linalg.norm(force, axis=-1) > 1.0,
+            sensors=physics.sensors,
+        )
+
+    def sense(self, key, motion):
+        """Noisy readings by name, and x_t (X,) made of them."""
+        sensed = {}
+        for name, key_one in zip(NOISE, jax.random.split(key, len(NOISE)), strict=True):
+            true, width = getattr(motion, name), self.config.noise * NOISE[name]
+            sensed[name] = true + uniform(key_one, -width, width, true.shape)
+        return sensed, jnp.concatenate([sensed[name] for name in PROP])
+
+    def observe(self, sensed, task, action):
+        """Observation (O,): noisy readings, task inputs and last action, each times its fixed scale."""
+        blocks = sensed | self.task_inputs(task, sensed) | {"action": action}
+        return jnp.concatenate(
+            [jnp.atleast_1d(blocks[name] * jnp.array(scale)) for name, (_, scale) in self.OBS.items()]
+        )
+
+    def task_inputs(self, task, sensed):
+        """Exact observation blocks that are the task's own (commands)."""
+        return {}
+
+    # --- kinematics ---
+
+    def leg_chains(self):
+        """Per link from the base to the foot: offset (F, 3), turn (F, 4), axis (F, 3), joint (F,); then the site."""
+        m, links = self.model, []
+        sites = [m.site(foot) for foot in self.robot.feet]
+        body = np.array([site.bodyid[0] for site in sites])
+        while body[0] != 1:
+            joint = m.body_jntadr[body]
+            links.append((m.body_pos[body], m.body_quat[body], m.jnt_axis[joint], joint - 1))
+            body = m.body_parentid[body]
+        return links[::-1], np.array([site.pos for site in sites])
+
+    def feet_in_base(self, joints):
+        """Foot sites (F, 3) in the base frame at joint angles (A,); exact at reset, where no sensor has been read."""
+        links, site = self.legs
+        pos, quat = jnp.zeros_like(site), jnp.tile(jnp.array([1.0, 0, 0, 0]), (len(site), 1))
+        for offset, turn, axis, joint in links:
+            pos = pos + rotate(quat, offset)
+            quat = multiply(multiply(quat, turn), axis_angle(jnp.asarray(axis), joints[joint]))
+        return pos + rotate(quat, site)
+
+    # --- mirrors ---
+
+    def width(self, kind):
+        """Length of an observation block."""
+        return self.action_dim if kind == "joint" else 3
+
+    def mirror_block(self, mirror, kind):
+        """perm, sign of one block of an observation."""
+        polar, axial = POLAR[mirror], AXIAL[mirror]
+        if kind == "joint":
+            return self.robot.mirror_joints(mirror)
+        signs = {"polar": polar, "axial": axial, "planar": np.array([polar[0], polar[1], axial[2]])}
+        return np.arange(3), signs[kind]
+
+    def mirror_tables(self, mirror):
+        """perm, sign for `obs`, `prop` and `action` vectors: mirrored = sign * original[perm]."""
+        tables = {}
+        kinds = {"obs": [kind for kind, _ in self.OBS.values()], "prop": list(PROP.values()), "action": ["joint"]}
+        for name, blocks in kinds.items():
+            perms, signs, start = [], [], 0
+            for kind in blocks:
+                perm, sign = self.mirror_block(mirror, kind)
+                perms.append(perm + start)
+                signs.append(sign)
+                start += len(perm)
+            tables[name] = np.concatenate(perms), np.concatenate(signs).astype(np.float32)
+        return tables
+
+    def mirror(self, mirror, name, array):
+        """Mirror image of obs, prop or action arrays (..., width); applying it twice gives the original."""
+        perm, sign = self.mirrors[mirror][name]
+        return array[..., perm] * sign
+
+
+def joint_indices(robot, *parts):
+    """Indices of the joints whose name contains one of `parts`."""
+    return np.array([i for i, joint in enumerate(robot.joints) if any(part in joint for part in parts)])
+
+
+def soft_limits(model, factor):
+    """Joint limits (A,), (A,) shrunk about their middle."""
+    low, high = model.jnt_range[1:].T
+    middle, half = (low + high) / 2, (high - low) / 2
+    return middle - factor * half, middle + factor * half
+
+
+def replace_checked(config, overrides):
+    """A config with some fields replaced; ValueError names a field that does not exist."""
+    fields = [field.name for field in dataclasses.fields(config)]
+    for name in overrides:
+        if name not in fields:
+            raise ValueError(f"unknown option {name!r}; choose one of {', '.join(sorted(fields))}")
+    return dataclasses.replace(config, **overrides)

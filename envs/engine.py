@@ -1,0 +1,209 @@
+"""Physics engines behind one interface: `step(physics, ctrl)` advances one simulation by one control step.
+
+    c     MuJoCo's own C code on a thread pool (mujoco.batch), called from inside jit; for CPUs
+    mjx   MuJoCo rewritten in JAX; for GPUs and TPUs
+
+Both are pure functions of a `Physics` and may be vmapped, to any depth.
+"""
+
+import threading
+
+import flax
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from mujoco import mjx
+from mujoco.mjx._src import support as mjx_support  # contact_force_dim has no public name; mujoco-mjx is pinned
+
+
+@flax.struct.dataclass
+class Physics:
+    """One simulation, float32. nq, nv, nu, nbody as in MuJoCo; S sensor values; M mocap bodies."""
+
+    # state
+    qpos: jax.Array  # (nq,) base position (world), base quaternion wxyz, joint angles
+    qvel: jax.Array  # (nv,) base velocity (world), base angular velocity (base frame), joint velocities
+    warmstart: jax.Array  # (nv,) the solver's first guess
+    # what tasks and randomisation set
+    mocap_pos: jax.Array  # (M, 3) [m]
+    mocap_quat: jax.Array  # (M, 4)
+    wrench: jax.Array  # (nbody, 6) force [N] and torque [N m] on each body, world frame
+    friction: jax.Array  # () sliding coefficient of all the robot's geoms
+    mass_scale: jax.Array  # (nbody,) multiplies mass and inertia
+    # what the last step measured
+    qacc: jax.Array  # (nv,) in the last physics step
+    torque: jax.Array  # (nu,) [N m] kp part of the last physics step, kd part of now
+    sensors: jax.Array  # (S,) site poses and velocities now, contact forces of the last physics step
+
+
+class Engine:
+    """What both engines share: the compiled model, the randomised fields and the sensor layout."""
+
+    def __init__(self, spec, decimation):
+        self.model, self.decimation = spec.compile(), decimation
+        self.robot_geoms = self.model.geom_contype > 0
+
+    def initial(self, qpos, qvel, friction, mass_scale):
+        """Physics at a given state, at rest in its solver and with nothing measured yet."""
+        m = self.model
+        return Physics(
+            qpos=qpos,
+            qvel=qvel,
+            warmstart=jnp.zeros(m.nv),
+            mocap_pos=jnp.zeros((m.nmocap, 3)),
+            mocap_quat=jnp.tile(jnp.array([1.0, 0, 0, 0]), (m.nmocap, 1)),
+            wrench=jnp.zeros((m.nbody, 6)),
+            friction=friction,
+            mass_scale=mass_scale,
+            qacc=jnp.zeros(m.nv),
+            torque=jnp.zeros(m.nu),
+            sensors=jnp.zeros(m.nsensordata),
+        )
+
+    def sensor(self, *names):
+        """Indices into `Physics.sensors`, (len(names), width)."""
+        found = [self.model.sensor(name) for name in names]
+        return np.array([np.arange(s.adr[0], s.adr[0] + s.dim[0]) for s in found])
+
+    def joint_torque(self, qfrc_actuator, qvel):
+        """PD torque (nu,) [N m]: the limited kp part, and the kd part that the MJCF holds as joint damping."""
+        return qfrc_actuator[6:] - self.model.dof_damping[6:] * qvel[6:]
+
+    def randomised(self, xp, friction, mass_scale):
+        """Model fields of simulations with leading dimensions `...`, by the array module xp (numpy or jax.numpy)."""
+        m = self.model
+        sliding = xp.where(self.robot_geoms, friction[..., None], m.geom_friction[:, 0])
+        rest = xp.broadcast_to(m.geom_friction[:, 1:], (*sliding.shape, 2))
+        # Mass-dependent constants of the constraint regularisation (mj_setConst) keep their nominal values.
+        return {
+            "geom_friction": xp.concatenate([sliding[..., None], rest], -1),
+            "body_mass": m.body_mass * mass_scale,
+            "body_inertia": m.body_inertia * mass_scale[..., None],
+        }
+
+
+class CEngine(Engine):
+    """MuJoCo C on all CPU threads. Results do not depend on the number of threads."""
+
+    INPUTS = ("qpos", "qvel", "warmstart", "mocap_pos", "mocap_quat", "wrench", "friction", "mass_scale")
+    OUTPUTS = ("qpos", "qvel", "warmstart", "qacc", "sensors", "qfrc_actuator")
+    # our field -> MjData's, where they differ
+    MUJOCO = {"warmstart": "qacc_warmstart", "wrench": "xfrc_applied", "sensors": "sensordata"}
+
+    def __init__(self, spec, decimation):
+        super().__init__(spec, decimation)
+        self.batches = {}  # number of simulations -> Batch
+        self.lock = threading.Lock()  # a Batch must not be entered twice
+
+    def step(self, physics, ctrl):
+        """Advance by `decimation` physics steps with joint targets ctrl (nu,) [rad]."""
+        m = self.model
+        sizes = dict.fromkeys(self.OUTPUTS, m.nv) | {"qpos": m.nq, "sensors": m.nsensordata}
+        shapes = {name: jax.ShapeDtypeStruct((size,), jnp.float32) for name, size in sizes.items()}
+        inputs = {name: getattr(physics, name) for name in self.INPUTS}
+        out = jax.pure_callback(self.run, shapes, inputs, ctrl, vmap_method="broadcast_all")
+        torque = self.joint_torque(out.pop("qfrc_actuator"), out["qvel"])
+        return physics.replace(**out, torque=torque)
+
+    def run(self, inputs, ctrl):
+        """The callback: numpy in, numpy out, leading dimensions of any rank. It must not call JAX (deadlock)."""
+        inputs = {name: np.asarray(value) for name, value in inputs.items()}
+        ctrl = np.asarray(ctrl)
+        lead = ctrl.shape[:-1]
+        count = int(np.prod(lead))
+        with self.lock:
+            batch = self.batch(count)
+            fields = self.randomised(np, inputs.pop("friction"), inputs.pop("mass_scale"))
+            for name, value in fields.items():
+                per_sim = batch.expand(name)
+                per_sim[:] = value.reshape(per_sim.shape)
+            for name, value in (inputs | {"ctrl": ctrl}).items():
+                row = batch.bind(self.MUJOCO.get(name, name))
+                row[:] = value.reshape(row.shape)
+            batch.step(nstep=self.decimation, stage=mujoco.mjtStage.mjSTAGE_VEL)
+            return {
+                name: batch.bind(self.MUJOCO.get(name, name)).astype(np.float32).reshape(*lead, -1)
+                for name in self.OUTPUTS
+            }
+
+    def batch(self, count):
+        """The Batch of `count` simulations, made once, its outputs bound so that they are copied out."""
+        if count not in self.batches:
+            from mujoco.batch import Batch  # here, so that other engines run where it is missing
+
+            self.batches[count] = Batch(self.model, count)
+            for name in self.OUTPUTS:
+                self.batches[count].bind(self.MUJOCO.get(name, name))
+        return self.batches[count]
+
+
+class MjxEngine(Engine):
+    """MJX in JAX. It has no net-force contact sensors, so those are left out of its model and computed here."""
+
+    def __init__(self, spec, decimation):
+        super().__init__(spec, decimation)
+        self.touching = self.contact_sensors()  # (contact sensors, ngeom)
+        spec = spec.copy()
+        for sensor in [s for s in spec.sensors if s.type == mujoco.mjtSensor.mjSENS_CONTACT]:
+            spec.delete(sensor)
+        self.mjx_model = mjx.put_model(spec.compile(), impl="jax")
+        self.mjx_data = mjx.make_data(self.mjx_model, impl="jax")
+
+    def contact_sensors(self):
+        """Which geoms each contact sensor covers, (sensors, ngeom) of 0 and 1. They must come last in the MJCF."""
+        m, rows = self.model, []
+        for i in np.flatnonzero(m.sensor_type == mujoco.mjtSensor.mjSENS_CONTACT):
+            covers_body = m.sensor_reftype[i] == mujoco.mjtObj.mjOBJ_BODY
+            rows.append((m.geom_bodyid if covers_body else np.arange(m.ngeom)) == m.sensor_refid[i])
+        first = m.nsensordata - 3 * len(rows)
+        if rows and first != m.sensor_adr[m.sensor_type == mujoco.mjtSensor.mjSENS_CONTACT][0]:
+            raise ValueError("contact sensors must stand after all other sensors in the MJCF")
+        return np.array(rows, np.float32).reshape(-1, m.ngeom)
+
+    def step(self, physics, ctrl):
+        """Advance by `decimation` physics steps with joint targets ctrl (nu,) [rad]."""
+        fields = self.randomised(jnp, physics.friction, physics.mass_scale)
+        model = self.mjx_model.tree_replace(fields)
+        data = self.mjx_data.replace(
+            qpos=physics.qpos,
+            qvel=physics.qvel,
+            qacc_warmstart=physics.warmstart,
+            mocap_pos=physics.mocap_pos,
+            mocap_quat=physics.mocap_quat,
+            xfrc_applied=physics.wrench,
+            ctrl=ctrl,
+        )
+        data, _ = jax.lax.scan(lambda d, _: (mjx.step(model, d), None), data, None, self.decimation)
+        forces = self.net_forces(model, data)
+        now = mjx.com_vel(model, mjx.com_pos(model, mjx.kinematics(model, data)))
+        sites = mjx.sensor_vel(model, mjx.sensor_pos(model, now)).sensordata
+        return physics.replace(
+            qpos=data.qpos,
+            qvel=data.qvel,
+            warmstart=data.qacc_warmstart,
+            qacc=data.qacc,
+            torque=self.joint_torque(data.qfrc_actuator, data.qvel),
+            sensors=jnp.concatenate([sites, forces.ravel()]),
+        )
+
+    def net_forces(self, model, data):
+        """Net contact force on each contact sensor's geoms, world frame, (sensors, 3) [N]."""
+        contact = data._impl.contact
+        force, index = mjx_support.contact_force_dim(model, data, 3)  # in the contact frame
+        world = jnp.einsum("cij,ci->cj", contact.frame[index], force[:, :3])
+        one, two = contact.geom[index].T
+        touching = jnp.asarray(self.touching)
+        return (touching[:, two] - touching[:, one]) @ world
+
+
+ENGINES = {"c": CEngine, "mjx": MjxEngine}
+
+
+def make_engine(name, spec, decimation):
+    """Build an engine; "auto" takes c on a CPU and mjx elsewhere. ValueError for a name that does not exist."""
+    if name == "auto":
+        name = "c" if jax.default_backend() == "cpu" else "mjx"
+    if name not in ENGINES:
+        raise ValueError(f"unknown engine {name!r}; choose one of auto, {', '.join(ENGINES)}")
+    return ENGINES[name](spec, decimation)

@@ -1,0 +1,114 @@
+"""Pictures of a rollout: a filmstrip PNG and a GIF, by MuJoCo's renderer or, where there is no OpenGL, by matplotlib.
+
+MuJoCo chooses its OpenGL for good when it is imported, and a broken driver can end the process. So frames are drawn
+in a second process, this file run as a script, which is tried with one OpenGL after the other.
+"""
+
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import mujoco
+import numpy as np
+from PIL import Image, ImageDraw
+
+WIDTH, HEIGHT = 320, 240  # [pixels] of one frame
+
+
+def film(env, qpos, folder, start=4.0, strip_seconds=1.0, strip_frames=10, gif_seconds=4.0):
+    """Write rollout.png (frames of one second) and rollout.gif of qpos (steps, nq). Returns the two paths.
+
+    The film starts `start` seconds in, when the robot has found its pace, or earlier if the rollout is short.
+    """
+    qpos = np.asarray(qpos, np.float64)
+    first = max(0, min(round(start / env.dt), len(qpos) - round(gif_seconds / env.dt)))
+    moving = np.arange(first, min(first + round(gif_seconds / env.dt), len(qpos)), 2)
+    strip = first + np.round(np.linspace(0, strip_seconds, strip_frames, endpoint=False) / env.dt).astype(int)
+    strip = strip[strip < len(qpos)]
+    shown = np.unique(np.concatenate([moving, strip]))
+    images = dict(zip(shown, draw(env.scene(visual=True), qpos[shown]), strict=True))
+
+    sheet = Image.new("RGB", (WIDTH * 5, HEIGHT * -(-len(strip) // 5)), "white")
+    for place_in_sheet, i in enumerate(strip):
+        frame = images[i].copy()
+        ImageDraw.Draw(frame).text((6, 4), f"{i * env.dt:.2f} s", fill=(40, 40, 40))
+        sheet.paste(frame, (place_in_sheet % 5 * WIDTH, place_in_sheet // 5 * HEIGHT))
+    png, gif = folder / "rollout.png", folder / "rollout.gif"
+    sheet.save(png, optimize=True)
+    frames = [images[i].quantize(64) for i in moving]
+    frames[0].save(gif, save_all=True, append_images=frames[1:], duration=round(2000 * env.dt), loop=0)
+    return png, gif
+
+
+def draw(spec, qpos):
+    """Images of poses (n, nq), by the first OpenGL that works, else by matplotlib."""
+    model = spec.compile()
+    wanted = os.environ.get("MUJOCO_GL")
+    names = [wanted] if wanted else (["glfw"] if os.environ.get("DISPLAY") else []) + ["egl", "osmesa"]
+    with tempfile.TemporaryDirectory() as folder:
+        Path(folder, "model.xml").write_text(spec.to_xml())
+        np.save(Path(folder, "qpos.npy"), qpos)
+        for name in names:
+            command = [sys.executable, __file__, folder]
+            run = subprocess.run(command, env=os.environ | {"MUJOCO_GL": name}, capture_output=True, check=False)
+            if run.returncode == 0:
+                return [Image.fromarray(frame) for frame in np.load(Path(folder, "frames.npy"))]
+    print(
+        "no OpenGL here (tried "
+        + ", ".join(names)
+        + "): drawing stick figures; Debian's libosmesa6 gives real pictures"
+    )
+    data = mujoco.MjData(model)
+    return [stick_figure(model, data, q) for q in qpos]
+
+
+def render(folder):
+    """In the second process: poses in qpos.npy of model.xml become frames.npy (n, HEIGHT, WIDTH, 3)."""
+    model = mujoco.MjModel.from_xml_path(str(Path(folder, "model.xml")))
+    data, frames = mujoco.MjData(model), []
+    with mujoco.Renderer(model, HEIGHT, WIDTH) as renderer:
+        for qpos in np.load(Path(folder, "qpos.npy")):
+            place(model, data, qpos)
+            renderer.update_scene(data, camera="track")
+            frames.append(renderer.render().copy())
+    np.save(Path(folder, "frames.npy"), np.array(frames))
+
+
+def place(model, data, qpos):
+    """Set a pose and compute where everything is."""
+    data.qpos[:] = qpos
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)
+    mujoco.mj_camlight(model, data)
+
+
+def stick_figure(model, data, qpos):
+    """Bodies joined to their parents as seen from the right side, with the ground line. Returns an Image."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    place(model, data, qpos)
+    fig, ax = plt.subplots(figsize=(WIDTH / 100, HEIGHT / 100), dpi=100)
+    for body in range(2, model.nbody):
+        a, b = data.xpos[model.body_parentid[body]], data.xpos[body]
+        ax.plot([a[0], b[0]], [a[2], b[2]], "-o", color="0.3", lw=2, ms=2)
+    for geom in np.flatnonzero((model.geom_group == 3) & (model.geom_bodyid > 0)):
+        a, b = data.xpos[model.geom_bodyid[geom]], data.geom_xpos[geom]
+        ax.plot([a[0], b[0]], [a[2], b[2]], "-", color="tab:red", lw=1)
+    ax.axhline(0, color="0.6")
+    ax.set_xlim(qpos[0] - 0.9, qpos[0] + 0.9)
+    ax.set_ylim(-0.1, 1.4)
+    ax.set_aspect("equal")
+    ax.axis("off")
+    fig.canvas.draw()
+    image = Image.fromarray(np.asarray(fig.canvas.buffer_rgba())[..., :3].copy())
+    plt.close(fig)
+    return image
+
+
+if __name__ == "__main__":
+    render(sys.argv[1])

@@ -1,0 +1,53 @@
+"""Reward terms that several tasks use. Each takes true (noise-free) quantities of one environment and returns ().
+
+Terms are unweighted and per second: a task multiplies them by its weights and by the control step.
+"""
+
+import jax.numpy as jnp
+
+
+def track_lin_vel(command, lin_vel):
+    """Commanded minus actual horizontal velocity, (2,) each [m/s], through a Gaussian kernel of width 0.5 m/s."""
+    return jnp.exp(-jnp.sum((command - lin_vel) ** 2) / 0.25)
+
+
+def track_yaw_rate(command, yaw_rate):
+    """Commanded minus actual turning rate, () each [rad/s], through a Gaussian kernel of width 0.5 rad/s."""
+    return jnp.exp(-((command - yaw_rate) ** 2) / 0.25)
+
+
+def square(x):
+    """Sum of squares: torques, joint accelerations, action rates, unwanted velocities and tilts."""
+    return jnp.sum(x**2)
+
+
+def air_time(landed_after, threshold, command):
+    """Flight time above a threshold [s], paid when a foot lands; landed_after (F,) [s] is 0 for all other feet."""
+    return jnp.sum(jnp.where(landed_after > 0, landed_after - threshold, 0.0)) * moving(command)
+
+
+def single_stance(air_time, contact_time, command):
+    """Biped gait: how long this leg swings and the other stands, at most 0.4 s; 0 in flight or on both feet."""
+    contact = contact_time > 0
+    phase = jnp.where(contact, contact_time, air_time)
+    return jnp.where(jnp.sum(contact) == 1, jnp.minimum(jnp.min(phase), 0.4), 0.0) * moving(command)
+
+
+def moving(command):
+    """1 if the command asks for more than 0.1 m/s, else 0: standing still must not be punished for lack of steps."""
+    return jnp.linalg.norm(command[:2]) > 0.1
+
+
+def slip(foot_vel, contact):
+    """Horizontal speed [m/s] of the feet on the ground; foot_vel (F, 3), contact (F,)."""
+    return jnp.sum(jnp.linalg.norm(foot_vel[:, :2], axis=-1) * contact)
+
+
+def touching(force):
+    """Number of bodies that bear more than 1 N; force (B, 3)."""
+    return jnp.sum(jnp.linalg.norm(force, axis=-1) > 1.0)
+
+
+def beyond(joint_pos, low, high):
+    """Joint angle outside soft limits, summed [rad]."""
+    return jnp.sum(jnp.maximum(low - joint_pos, 0) + jnp.maximum(joint_pos - high, 0))

@@ -1,0 +1,113 @@
+"""The three robots: joint order, default pose, gains' action scale, feet and mirror symmetries.
+
+A robot's masses, shapes and PD gains are in its MJCF under assets/; what a policy must know besides is here.
+Legend: A joints (and actions), F feet.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+ASSETS = Path(__file__).resolve().parent.parent / "assets"
+
+# A reflection negates one component of a polar vector (velocity, gravity, foot position) and the other two
+# of an axial one (angular velocity, joint axis).
+POLAR = {"left_right": np.array([1, -1, 1]), "front_back": np.array([-1, 1, 1])}
+AXIAL = {"left_right": np.array([-1, 1, -1]), "front_back": np.array([1, -1, -1])}
+
+
+@dataclass(frozen=True)
+class Robot:
+    """What a policy needs to know of a robot. Every (A,) tuple follows `joints`, the actuator order of the MJCF."""
+
+    name: str  # also the file assets/<name>.xml
+    joints: tuple[str, ...]
+    axes: str  # (A,) letters x, y or z: each joint's axis in the base frame at q = 0
+    default_pose: tuple[float, ...]  # (A,) [rad] what action zero commands
+    action_scale: float  # [rad] of joint target a unit of action
+    feet: tuple[str, ...]  # (F,) sites; sensors <foot>_pos, <foot>_vel and <foot>_force
+    sole: float  # [m] from a foot's site down to the ground it stands on
+    mirrors: dict[str, dict[str, str]]  # symmetry -> which name parts it exchanges
+
+    @property
+    def xml(self):
+        return ASSETS / f"{self.name}.xml"
+
+    def exchange(self, mirror, name):
+        """The joint or foot that `name` becomes in a mirror."""
+        parts = self.mirrors[mirror]
+        for part, other in parts.items():
+            if name.startswith(part):
+                return other + name[len(part) :]
+        return name
+
+    def mirror_joints(self, mirror):
+        """perm (A,), sign (A,): mirrored[i] = sign[i] * original[perm[i]], for positions, velocities and actions."""
+        perm = [self.joints.index(self.exchange(mirror, joint)) for joint in self.joints]
+        return np.array(perm), np.array([AXIAL[mirror]["xyz".index(axis)] for axis in self.axes])
+
+    def mirror_feet(self, mirror):
+        """perm (F,) of the feet."""
+        return np.array([self.feet.index(self.exchange(mirror, foot)) for foot in self.feet])
+
+
+def pairs(*names):
+    """('LF', 'RF') -> {'LF': 'RF', 'RF': 'LF'}, over consecutive pairs."""
+    return {a: b for i in range(0, len(names), 2) for a, b in (names[i : i + 2], names[i : i + 2][::-1])}
+
+
+# Pose: Isaac Lab's ANYMAL_D_CFG.
+ANYMAL_D = Robot(
+    name="anymal_d",
+    joints=tuple(f"{leg}_{joint}" for leg in ("LF", "RF", "LH", "RH") for joint in ("HAA", "HFE", "KFE")),
+    axes="xyy" * 4,
+    default_pose=(0.0, 0.4, -0.8) * 2 + (0.0, -0.4, 0.8) * 2,
+    action_scale=0.5,
+    feet=("LF_foot", "RF_foot", "LH_foot", "RH_foot"),
+    sole=0.031455,
+    mirrors={
+        "left_right": pairs("LF", "RF", "LH", "RH"),
+        "front_back": pairs("LF", "LH", "RF", "RH"),
+    },
+)
+
+# Pose: MuJoCo Menagerie's "home". Front-back is no symmetry here: all knees bend the same way.
+# Deviation: Isaac Lab's pose (thighs 0.8 and 1.0, calves -1.5) lets the hind feet trail; see README.
+GO1 = Robot(
+    name="go1",
+    joints=tuple(f"{leg}_{joint}_joint" for leg in ("FR", "FL", "RR", "RL") for joint in ("hip", "thigh", "calf")),
+    axes="xyy" * 4,
+    default_pose=(0.0, 0.9, -1.8) * 4,
+    action_scale=0.25,
+    feet=("FR_foot", "FL_foot", "RR_foot", "RL_foot"),
+    sole=0.023,
+    mirrors={"left_right": pairs("FR", "FL", "RR", "RL")},
+)
+
+G1_LEG = ("hip_pitch", "hip_roll", "hip_yaw", "knee", "ankle_pitch", "ankle_roll")
+G1_WAIST = ("waist_yaw", "waist_roll", "waist_pitch")
+G1_ARM = ("shoulder_pitch", "shoulder_roll", "shoulder_yaw", "elbow", "wrist_roll", "wrist_pitch", "wrist_yaw")
+
+# Pose: MuJoCo Playground's "knees bent".
+G1 = Robot(
+    name="g1",
+    joints=(
+        *(f"{side}_{joint}_joint" for side in ("left", "right") for joint in G1_LEG),
+        *(f"{joint}_joint" for joint in G1_WAIST),
+        *(f"{side}_{joint}_joint" for side in ("left", "right") for joint in G1_ARM),
+    ),
+    axes="yxzyyx" * 2 + "zxy" + "yxzyxyz" * 2,
+    default_pose=(
+        *(-0.312, 0.0, 0.0, 0.669, -0.363, 0.0) * 2,
+        *(0.0, 0.0, 0.073),
+        *(0.2, 0.2, 0.0, 0.6, 0.0, 0.0, 0.0),
+        *(0.2, -0.2, 0.0, 0.6, 0.0, 0.0, 0.0),
+    ),
+    action_scale=0.5,
+    feet=("left_foot", "right_foot"),
+    sole=0.0,
+    mirrors={"left_right": pairs("left", "right")},
+)
+
+ROBOTS = {robot.name: robot for robot in (ANYMAL_D, GO1, G1)}

@@ -1,0 +1,38 @@
+"""Environments are built and compiled once for the whole suite."""
+
+import functools
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+
+import envs
+
+
+class Jitted:
+    """A task with its reset and step vmapped and compiled; cfg overrides as in envs.make."""
+
+    def __init__(self, task, engine="c", **overrides):
+        self.env = envs.make(task, engine, **overrides)
+        self.reset = jax.jit(jax.vmap(self.env.reset))
+        self.step = jax.jit(jax.vmap(self.env.step))
+
+    def start(self, num_envs, seed=0):
+        return self.reset(jax.random.split(jax.random.key(seed), num_envs))
+
+    def act(self, state, seed, std=0.5):
+        shape = (state.reward.shape[0], self.env.action_dim)
+        return self.step(state, std * jax.random.normal(jax.random.key(seed), shape))
+
+    def hold(self, state):
+        return self.step(state, jnp.zeros((state.reward.shape[0], self.env.action_dim)))
+
+
+@pytest.fixture(scope="session")
+def jitted():
+    """jitted(task, **overrides) -> Jitted, cached."""
+    return functools.cache(Jitted)

@@ -1,0 +1,334 @@
+"""The environment contract: history, resets, time limits, noise, randomisation, mirrors, broken simulations."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+import envs
+from envs.base import PROP
+from envs.engine import ENGINES, make_engine
+from envs.robots import ROBOTS
+
+TASKS = list(envs.TASKS)
+
+
+def assert_trees_equal(a, b):
+    jax.tree.map(np.testing.assert_array_equal, jax.tree.map(np.asarray, a), jax.tree.map(np.asarray, b))
+
+
+def without_keys(state):
+    """A state whose random keys are plain numbers, so that numpy can compare them."""
+    return state.replace(key=jax.random.key_data(state.key))
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_contract(task):
+    """Reset and step give the same pytree, with strong types: a weak one would compile everything twice."""
+    env = envs.make(task, "c")
+    start = jax.eval_shape(env.reset, jax.random.key(0))
+    after = jax.eval_shape(env.step, start, jnp.zeros(env.action_dim))
+    assert jax.tree.structure(start) == jax.tree.structure(after)
+    for (path, a), b in zip(jax.tree.leaves_with_path(start), jax.tree.leaves(after), strict=True):
+        assert (a.shape, a.dtype, a.weak_type) == (b.shape, b.dtype, b.weak_type), jax.tree_util.keystr(path)
+    assert start.obs.shape == (env.obs_dim,)
+    assert start.history["prop"].shape == (env.config.history + 1, env.prop_dim)
+    assert start.history["action"].shape == (env.config.history, env.action_dim)
+    assert set(env.config.weights) == {name[7:] for name in start.metrics if name.startswith("reward/")}
+
+
+def test_observation_widths():
+    assert {task: envs.make(task, "c").obs_dim for task in TASKS} == {"anymal_loco": 48, "go1_loco": 48, "g1_loco": 99}
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_same_key_same_rollout(jitted, task):
+    runs = []
+    for _ in range(2):
+        state = jitted(task).start(4)
+        for i in range(5):
+            state = jitted(task).act(state, i)
+        runs.append(without_keys(state))
+    assert_trees_equal(*runs)
+    assert not np.array_equal(jitted(task).start(4, seed=1).obs, jitted(task).start(4, seed=0).obs)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_robots_start_on_their_feet(jitted, task):
+    """At reset the lowest foot site is `sole` above the ground, by MuJoCo's kinematics; nobody starts inside it."""
+    env, state = jitted(task).env, jitted(task).start(16)
+    data = mujoco.MjData(env.model)
+    for qpos in np.asarray(state.physics.qpos):
+        data.qpos[:] = qpos
+        mujoco.mj_forward(env.model, data)
+        lowest = min(data.site(foot).xpos[2] for foot in env.robot.feet)
+        assert lowest == pytest.approx(env.robot.sole, abs=1e-5)
+        assert all(contact.dist > -0.01 for contact in data.contact)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_motion_is_what_mujoco_says(jitted, task):
+    """Velocities, gravity and feet of Motion against MuJoCo's own sensors and frames, after some steps."""
+    env, state = jitted(task).env, jitted(task).start(4)
+    for i in range(8):
+        state = jitted(task).act(state, i)
+    motion = jax.vmap(env.motion)(state.physics)
+    data = mujoco.MjData(env.model)
+    for n in range(4):
+        data.qpos[:], data.qvel[:] = state.physics.qpos[n], state.physics.qvel[n]
+        mujoco.mj_forward(env.model, data)
+        velocity = np.zeros(6)
+        mujoco.mj_objectVelocity(env.model, data, mujoco.mjtObj.mjOBJ_SITE, env.model.site("base").id, velocity, 1)
+        np.testing.assert_allclose(motion.ang_vel[n], velocity[:3], atol=1e-4)
+        np.testing.assert_allclose(motion.lin_vel[n], velocity[3:], atol=1e-4)
+        np.testing.assert_allclose(motion.gravity[n], -data.xmat[1].reshape(3, 3)[2], atol=1e-5)
+        for i, foot in enumerate(env.robot.feet):
+            np.testing.assert_allclose(motion.foot_pos[n, i], data.site(foot).xpos, atol=1e-5)
+            np.testing.assert_allclose(motion.foot_vel[n, i], data.sensor(f"{foot}_vel").data, atol=1e-3)
+
+
+def test_history_is_padded_then_shifts(jitted):
+    """The first x fills the history and actions are zero; then both move on by one, oldest first."""
+    task = jitted("go1_loco")
+    state = task.start(3)
+    first = np.asarray(state.history["prop"])
+    assert np.ptp(first, axis=1).max() == 0 and not np.any(state.history["action"])
+    actions, props = [], [first[:, -1]]
+    for i in range(8):
+        state = task.act(state, i)
+        actions.append(np.asarray(state.action))
+        props.append(np.asarray(state.history["prop"][:, -1]))
+        padded_props = [props[0]] * 6 + props[1:]
+        padded_actions = [np.zeros_like(actions[0])] * 5 + actions
+        np.testing.assert_array_equal(state.history["prop"], np.stack(padded_props[-6:], 1))
+        np.testing.assert_array_equal(state.history["action"], np.stack(padded_actions[-5:], 1))
+
+
+def test_history_is_what_the_policy_saw(jitted):
+    """x_t in the history carries the same noise as the observation of the same step."""
+    env, state = jitted("go1_loco").env, jitted("go1_loco").start(3)
+    state = jitted("go1_loco").act(state, 0)
+    obs, prop = np.asarray(state.obs), np.asarray(state.history["prop"][:, -1])
+    scales = {name: scale for name, (_, scale) in env.OBS.items()}
+    for name, in_obs, in_prop in [
+        ("ang_vel", slice(3, 6), slice(0, 3)),
+        ("gravity", slice(6, 9), slice(3, 6)),
+        ("joint_pos", slice(12, 24), slice(6, 18)),
+        ("joint_vel", slice(24, 36), slice(18, 30)),
+    ]:
+        np.testing.assert_allclose(obs[:, in_obs], prop[:, in_prop] * scales[name], rtol=1e-6)
+
+
+def test_noise_has_the_stated_width(jitted):
+    env = jitted("go1_loco").env
+    state = jitted("go1_loco").start(256)
+    exact = np.asarray(jax.vmap(env.motion)(state.physics).joint_vel)
+    seen = np.asarray(state.history["prop"][:, -1, 18:30]) - exact
+    assert 1.4 < np.abs(seen).max() <= 1.5
+    assert np.std(seen) == pytest.approx(3.0 / 12**0.5, rel=0.05)
+
+
+def overturned(state):
+    """The first robot lies on its back, the others stand."""
+    flipped = state.physics.qpos.at[0, 3:7].set(jnp.array([0.0, 1, 0, 0])).at[0, 2].set(0.05)
+    return state.replace(physics=state.physics.replace(qpos=flipped))
+
+
+def test_failure_resets_everything(jitted):
+    """A fallen robot terminates; what follows is a fresh episode, what was is in final_obs."""
+    task = jitted("go1_loco")
+    state = task.start(2)
+    for i in range(3):
+        state = task.act(state, i)
+    after = task.hold(overturned(state))
+    assert after.terminated.tolist() == [True, False] and after.truncated.tolist() == [False, False]
+    assert after.clock.tolist() == [0, 4] and after.episode_return[0] == 0 and after.episode_return[1] != 0
+    assert not np.any(after.action[0]) and not np.any(after.history["action"][0])
+    assert np.ptp(after.history["prop"][0], axis=0).max() == 0
+    assert not np.any(after.physics.qvel[0]) and not np.any(after.task.air_time[0])
+    assert after.physics.qpos[0, 2] == pytest.approx(float(jitted("go1_loco").start(1).physics.qpos[0, 2]), abs=1e-6)
+    assert after.final_obs[0, 8] > 0.5 > after.obs[0, 8], "gravity in final_obs is of the overturned robot"
+    np.testing.assert_array_equal(after.final_obs[1], after.obs[1])
+    np.testing.assert_array_equal(after.final_history["prop"][1], after.history["prop"][1])
+    assert not np.array_equal(after.task.command[0], state.task.command[0])
+
+
+def test_time_limit_truncates(jitted):
+    task = jitted("go1_loco")
+    keys = jax.random.split(jax.random.key(0), 2)
+    last = task.env.episode_steps - 1
+    state = jax.jit(jax.vmap(task.env.reset))(keys, jnp.array([last, 0]))
+    after = task.hold(state)
+    assert after.truncated.tolist() == [True, False] and not np.any(after.terminated)
+    assert after.clock.tolist() == [0, 1]
+    assert after.metrics["episode_seconds"][0] == pytest.approx(20.0)
+    assert not np.array_equal(after.final_obs[0], after.obs[0])
+
+
+def test_divergence_is_caught_and_counted(jitted):
+    """A simulation that blows up ends, is counted, and leaves only finite numbers behind."""
+    task = jitted("go1_loco")
+    state = task.start(3)
+    state = state.replace(
+        physics=state.physics.replace(qvel=state.physics.qvel.at[0, 8].set(jnp.nan).at[1, 7].set(1e9))
+    )
+    after = task.hold(state)
+    assert after.terminated.tolist() == [True, True, False]
+    assert after.metrics["diverged"].tolist() == [True, True, False]
+    for leaf in jax.tree.leaves(without_keys(after)):
+        assert np.all(np.isfinite(np.asarray(leaf, np.float64)))
+
+
+def test_command_follows_the_heading(jitted):
+    """The turning command is half the heading error within +-1; standing commands are exactly zero."""
+    env, state = jitted("go1_loco").env, jitted("go1_loco").start(512)
+    command, moves = np.asarray(state.task.command), np.asarray(state.task.moves)
+    w, x, y, z = np.asarray(state.physics.qpos[:, 3:7]).T
+    yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    error = (np.asarray(state.task.heading) - yaw + np.pi) % (2 * np.pi) - np.pi
+    np.testing.assert_allclose(command[moves, 2], np.clip(0.5 * error, -1, 1)[moves], atol=1e-5)
+    assert not np.any(command[~moves]) and 0 < np.mean(~moves) < 0.06
+    assert np.abs(command[:, :2]).max() <= 1 and env.command_steps == 500
+
+
+def test_command_changes_when_due(jitted):
+    task = jitted("go1_loco")
+    state = task.start(2)
+    before = task.hold(state.replace(clock=jnp.array([498, 100], jnp.int32)))
+    after = task.hold(before)
+    changed = np.any(np.asarray(after.task.command[:, :2] != before.task.command[:, :2]), axis=1)
+    assert changed.tolist() == [True, False]
+
+
+def test_pushes(jitted):
+    """When the clock reaches push_at the horizontal velocity jumps by at most push_velocity; else it does not."""
+    task = jitted("anymal_loco")
+    state = task.start(64).replace(push_at=jnp.full(64, 1, jnp.int32))
+    quiet = task.hold(state.replace(push_at=jnp.full(64, 999, jnp.int32)))
+    pushed = task.hold(state)
+    jump = np.asarray(pushed.physics.qvel - quiet.physics.qvel)[:, :2]
+    assert 0.3 < np.abs(jump).max() <= 0.5 + 1e-5
+    assert np.all((np.asarray(pushed.push_at) >= 501) & (np.asarray(pushed.push_at) <= 751))
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_randomised_fields_reach_the_engine(engine):
+    """Heavier robots press harder, slippery ones slide, wrenches push: the same on every engine."""
+    env = envs.make("go1_loco", engine, noise=0.0, spawn_xy=0.0, spawn_yaw=0.0, added_mass=(0.0, 0.0))
+    one = env.spawn(jax.random.key(0))
+    trunk = env.model.body("trunk").id
+    batch = jax.tree.map(lambda x: jnp.stack([x] * 4), one)
+    batch = batch.replace(
+        mass_scale=batch.mass_scale.at[1, trunk].mul(2.0),
+        friction=batch.friction.at[2].set(0.0),
+        wrench=batch.wrench.at[2:, trunk, 0].set(20.0),
+    )
+    step = jax.jit(jax.vmap(env.engine.step))
+    for _ in range(25):
+        batch = step(batch, jnp.tile(env.default_pose, (4, 1)))
+    height, forward = np.asarray(batch.qpos)[:, [2, 0]].T
+    assert height[1] < height[0] - 0.01, "twice the trunk mass sags"
+    assert forward[2] > 0.2 > forward[3] > forward[0] - 0.05, "without friction a pull of 20 N slides the robot"
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_engines_agree(name):
+    """Same start, same random targets, 25 control steps on each engine (c in double, mjx in single precision).
+
+    Until the first feet slip the two differ by rounding; after that contact makes any two simulations part.
+    """
+    task = {"anymal_d": "anymal_loco", "go1": "go1_loco", "g1": "g1_loco"}[name]
+    paths = {}
+    for engine in ("c", "mjx"):
+        env = envs.make(task, engine, spawn_velocity=0.0, spawn_joints=(1.0, 1.0))
+        physics = jax.vmap(env.spawn)(jax.random.split(jax.random.key(0), 2))
+        targets = env.default_pose + 0.1 * jax.random.normal(jax.random.key(1), (25, 2, env.action_dim))
+        step = jax.vmap(env.engine.step)
+        run = jax.jit(lambda p, t, step=step: jax.lax.scan(lambda p, t: (step(p, t),) * 2, p, t))
+        paths[engine] = jax.device_get(run(physics, targets)[1])
+    a, b = paths["c"], paths["mjx"]
+    early, late = (1e-4, 5e-2) if name == "g1" else (1e-5, 1e-3)  # [m, rad]
+    np.testing.assert_allclose(a.qpos[:5], b.qpos[:5], atol=early)
+    np.testing.assert_allclose(a.qpos, b.qpos, atol=late)
+    np.testing.assert_allclose(a.torque[:5], b.torque[:5], atol=1e-2)
+    np.testing.assert_allclose(a.sensors[:5], b.sensors[:5], atol=1.0)  # contact forces reach 500 N
+
+
+def test_vmap_twice_is_one_batch(jitted):
+    """Seeds x environments through engine c: each seed's numbers are those of a run of its own, bit for bit."""
+    env = jitted("go1_loco").env
+    physics = jax.vmap(env.spawn)(jax.random.split(jax.random.key(0), 6))
+    targets = env.default_pose + 0.2 * jax.random.normal(jax.random.key(1), (6, 12))
+    flat = jax.jit(jax.vmap(env.engine.step))(physics, targets)
+    nest = jax.tree.map(lambda x: x.reshape(2, 3, *x.shape[1:]), (physics, targets))
+    nested = jax.jit(jax.vmap(jax.vmap(env.engine.step)))(*nest)
+    assert_trees_equal(flat, jax.tree.map(lambda x: x.reshape(6, *x.shape[2:]), nested))
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_mirrored_rollout_is_seen_mirrored(jitted, task):
+    """Simulate a robot and its mirror image; observation, x_t and reward of the one map onto those of the other."""
+    base = jitted(task, noise=0.0)
+    env = base.env
+    for mirror in env.mirrors:
+        perm, sign = env.robot.mirror_joints(mirror)
+        polar = {"left_right": [1, -1, 1], "front_back": [-1, 1, 1]}[mirror]
+        axial = [-s for s in polar]
+        quat = [1, axial[0], axial[1], axial[2]]
+        state = base.start(4)
+        p = state.physics
+
+        def reflect(qpos, qvel, quat=quat, polar=polar, axial=axial, perm=perm, sign=sign):
+            joints = [x[:, perm] * sign for x in (qpos[:, 7:], qvel[:, 6:])]
+            base_pos, turn = qpos[:, :3] * jnp.array(polar), qpos[:, 3:7] * jnp.array(quat)
+            base_vel = [qvel[:, :3] * jnp.array(polar), qvel[:, 3:6] * jnp.array(axial)]
+            return jnp.concatenate([base_pos, turn, joints[0]], 1), jnp.concatenate([*base_vel, joints[1]], 1)
+
+        qpos, qvel = reflect(p.qpos, p.qvel)
+        flipped_task = state.task.replace(
+            command=state.task.command * jnp.array([polar[0], polar[1], axial[2]]), heading=-state.task.heading
+        )
+        image = state.replace(physics=p.replace(qpos=qpos, qvel=qvel), task=flipped_task)
+        for i in range(4):
+            action = 0.3 * jax.random.normal(jax.random.key(i), (4, env.action_dim))
+            state = base.step(state, action)
+            image = base.step(image, env.mirror(mirror, "action", action))
+            assert not np.any(state.terminated | image.terminated)
+            np.testing.assert_allclose(image.obs, env.mirror(mirror, "obs", state.obs), atol=2e-3)
+            got, want = image.history["prop"][:, -1], env.mirror(mirror, "prop", state.history["prop"][:, -1])
+            np.testing.assert_allclose(got, want, atol=2e-3)
+            np.testing.assert_allclose(image.reward, state.reward, atol=1e-4)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_mirrors_are_involutions(jitted, task):
+    env = jitted(task).env
+    for mirror in env.mirrors:
+        for name, width in (("obs", env.obs_dim), ("prop", env.prop_dim), ("action", env.action_dim)):
+            x = jax.random.normal(jax.random.key(0), (3, width))
+            once = env.mirror(mirror, name, x)
+            assert not np.allclose(once, x)
+            np.testing.assert_array_equal(env.mirror(mirror, name, once), x)
+
+
+def test_wrong_names_are_listed():
+    with pytest.raises(ValueError, match="unknown task 'go2_loco'; choose one of anymal_loco, go1_loco, g1_loco"):
+        envs.make("go2_loco")
+    with pytest.raises(ValueError, match="unknown engine 'bullet'; choose one of auto, c, mjx"):
+        envs.make("go1_loco", "bullet")
+    with pytest.raises(ValueError, match="unknown option 'gravity'; choose one of"):
+        envs.make("go1_loco", gravity=0)
+
+
+def test_auto_engine_on_a_cpu():
+    spec = envs.make("go1_loco", "c").scene()
+    assert type(make_engine("auto", spec, 4)) is ENGINES["c"]
+
+
+def test_configs_are_frozen_and_prop_is_sensed():
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        envs.TASKS["go1_loco"][1].noise = 0
+    assert sum(3 if kind != "joint" else 12 for kind in PROP.values()) == envs.make("go1_loco", "c").prop_dim == 30

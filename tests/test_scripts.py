@@ -1,0 +1,179 @@
+"""The script end to end at smoke size, and what it says to bad input."""
+
+import csv
+import dataclasses
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+import envs
+import ppo_finetune as script
+
+ROOT = Path(__file__).resolve().parent.parent
+SMOKE = script.Args(preset="smoke")
+
+
+def run(*arguments, **kwargs):
+    """The script in a process of its own. Returns the finished process."""
+    command = [sys.executable, "ppo_finetune.py", *map(str, arguments)]
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300, check=False, **kwargs)
+
+
+def assert_refused(process, *words):
+    """Exit code 2 and one line on stderr that holds these words."""
+    assert process.returncode == 2, process.stderr
+    lines = [text for text in process.stderr.splitlines() if text.startswith("error: ")]
+    assert len(lines) == 1 and "Traceback" not in process.stderr, process.stderr
+    for word in words:
+        assert word in lines[0], lines[0]
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """A smoke run of g1_loco and its folder."""
+    out = tmp_path_factory.mktemp("runs") / "a"
+    state = script.main(dataclasses.replace(SMOKE, task="g1_loco", run_dir=str(out)))
+    return out, state
+
+
+def test_run_folder(trained):
+    out, state = trained
+    record = json.loads((out / "args.json").read_text())
+    assert record["task"] == "g1_loco" and record["num_envs"] == 4 and record["hidden"] == [256, 128, 128]
+    assert record["versions"]["mujoco"] == "3.17.0" and record["versions"]["commit"]
+    rows = list(csv.DictReader((out / "metrics.csv").open()))
+    assert [float(row["env_steps"]) for row in rows] == [32, 64]
+    assert {f"reward/{term}" for term in envs.TASKS["g1_loco"][1].weights} <= set(rows[0])
+    assert (out / "curve.png").stat().st_size > 5000
+    params, meta = script.load(out / "policy.msgpack")
+    assert meta["task"] == "g1_loco"
+    jax.tree.map(np.testing.assert_array_equal, params, jax.device_get(state.params))
+    assert not list(out.glob("*.tmp"))
+
+
+def test_same_seed_same_weights(trained, tmp_path):
+    again = script.main(dataclasses.replace(SMOKE, task="g1_loco", run_dir=str(tmp_path / "b")))
+    other = script.main(dataclasses.replace(SMOKE, task="g1_loco", seed=1, run_dir=str(tmp_path / "c")))
+    jax.tree.map(np.testing.assert_array_equal, trained[1].params, again.params)
+    kernel = ("params", "actor", "Dense_0", "kernel")
+    weights = [s.params[kernel[0]][kernel[1]][kernel[2]][kernel[3]] for s in (again, other)]
+    assert not np.array_equal(*weights)
+
+
+def test_one_compile(jitted):
+    """A chunk's output feeds the next chunk without another compilation."""
+    env = jitted("go1_loco").env
+    args = script.merge(SMOKE, env.config.ppo)
+    net = script.ActorCritic(args.hidden, env.action_dim, args.init_std)
+    opt = script.optax.scale_by_adam()
+    chunk = jax.jit(lambda s: script.iteration(args, env, net, opt, s))
+    state = script.init_state(args, env, net, opt)
+    for _ in range(3):
+        state, _ = chunk(state)
+    assert chunk._cache_size() == 1
+
+
+def test_first_actions_are_small(jitted):
+    """A fresh actor commands (nearly) the default pose whatever it sees."""
+    env = jitted("go1_loco").env
+    args = script.merge(SMOKE, env.config.ppo)
+    net = script.ActorCritic(args.hidden, env.action_dim, args.init_std)
+    state = script.init_state(args, env, net, script.optax.scale_by_adam())
+    assert np.abs(net.apply(state.params, state.env.obs, method=net.mean)).max() < 0.1
+
+
+def test_first_clocks_are_spread(jitted):
+    env = jitted("go1_loco").env
+    args = dataclasses.replace(script.merge(SMOKE, env.config.ppo), num_envs=64)
+    net = script.ActorCritic(args.hidden, env.action_dim, args.init_std)
+    clocks = np.asarray(script.init_state(args, env, net, script.optax.scale_by_adam()).env.clock)
+    assert clocks.min() < 200 and clocks.max() > 800 and clocks.max() < env.episode_steps
+
+
+def test_eval_prints_and_draws(trained):
+    out, _ = trained
+    process = run("--task", "g1_loco", "--eval", out / "policy.msgpack", "--eval-envs", 2)
+    assert process.returncode == 0, process.stderr
+    assert "lin_vel_error" in process.stdout and "falls" in process.stdout
+    assert (out / "rollout.png").stat().st_size > 10_000 and (out / "rollout.gif").read_bytes()[:4] == b"GIF8"
+    report = json.loads((out / "eval.json").read_text())
+    assert 0 < report["task"]["episode_seconds"] < 20 and report["task"]["falls"] == 1.0
+
+
+def test_pictures_without_opengl(trained, tmp_path):
+    """Where no OpenGL works the same files are drawn by matplotlib."""
+    target = tmp_path / "policy.msgpack"
+    target.write_bytes((trained[0] / "policy.msgpack").read_bytes())
+    environ = os.environ | {"MUJOCO_GL": "nothing"}
+    process = run("--task", "g1_loco", "--eval", target, "--eval-envs", 2, env=environ)
+    assert process.returncode == 0, process.stderr
+    assert "stick figures" in process.stdout and (tmp_path / "rollout.png").stat().st_size > 5000
+
+
+def test_wrong_policies_are_refused(trained, tmp_path):
+    policy = trained[0] / "policy.msgpack"
+    assert_refused(run("--task", "go1_loco", "--eval", policy), "is a policy for g1_loco, not for go1_loco")
+    assert_refused(run("--eval", tmp_path / "none.msgpack"), "cannot read policy", "No such file")
+    cut = tmp_path / "cut.msgpack"
+    cut.write_bytes(policy.read_bytes()[:-100])
+    assert_refused(run("--task", "g1_loco", "--eval", cut), "damaged")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["cut.msgpack"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--task", "go2_loco"], ["unknown task 'go2_loco'", "go1_loco"]),
+        (["--engine", "bullet"], ["unknown engine 'bullet'", "c, mjx"]),
+        (["--num-envs", "0"], ["--num-envs must be at least 1"]),
+        (["--num-minibatches", "5"], ["5 minibatches do not divide", "16"]),
+        (["--total-steps", "-1"], ["--total-steps must be at least 1"]),
+    ],
+)
+def test_bad_arguments_are_refused(arguments, words, tmp_path):
+    assert_refused(run("--preset", "smoke", "--run-dir", tmp_path / "run", *arguments), *words)
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_run_is_not_overwritten(trained):
+    before = (trained[0] / "metrics.csv").read_bytes()
+    assert_refused(run("--preset", "smoke", "--task", "g1_loco", "--run-dir", trained[0]), "--force")
+    assert (trained[0] / "metrics.csv").read_bytes() == before
+
+
+def test_unknown_preset_lists_the_right_ones():
+    process = run("--preset", "huge")
+    assert process.returncode == 2 and "smoke" in process.stderr and "Traceback" not in process.stderr
+
+
+def test_interrupt_keeps_the_files(tmp_path):
+    """Ctrl-C after the first row ends the run with policy, metrics and curve in place."""
+    command = [
+        sys.executable,
+        "ppo_finetune.py",
+        "--preset",
+        "smoke",
+        "--total-steps",
+        "100000000",
+        "--run-dir",
+        str(tmp_path),
+    ]
+    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        deadline = time.monotonic() + 120
+        while not (tmp_path / "policy.msgpack").exists() and time.monotonic() < deadline:
+            time.sleep(0.2)
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=60)
+    assert process.returncode == 0 and "interrupted" in out and "Traceback" not in err, err
+    rows = list(csv.DictReader((tmp_path / "metrics.csv").open()))
+    assert rows and all(None not in row.values() for row in rows)
+    script.load(tmp_path / "policy.msgpack")
+    assert (tmp_path / "curve.png").exists()
