@@ -8,11 +8,8 @@ The algorithm is that of rsl_rl, which the paper used; where we differ stands `D
 Shapes in comments: T rollout steps, N environments, B minibatch, O observation, A action.
 """
 
-import csv
 import dataclasses
 import json
-import platform
-import subprocess
 import sys
 import time
 from dataclasses import dataclass
@@ -23,11 +20,11 @@ import flax
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
-import mujoco
 import optax
 import tyro
 
 import envs
+from envs import records
 
 jax.config.update("jax_default_matmul_precision", "highest")  # TF32 changes what is learned
 
@@ -76,10 +73,6 @@ PRESETS = {
 }
 
 
-class UserError(Exception):
-    """Bad input: printed as one line, exit code 2."""
-
-
 def merge(args, ppo):
     """Fill what is None in args from the preset, then from the task's own settings `ppo`; check the sizes."""
     values = PRESETS[args.preset] | ppo.get(args.preset, {})
@@ -88,9 +81,9 @@ def merge(args, ppo):
     args = dataclasses.replace(args, **{name: v for name, v in values.items() if getattr(args, name) is None})
     for name in ("num_envs", "num_steps", "total_steps", "log_every", "num_epochs", "num_minibatches", "eval_envs"):
         if getattr(args, name) < 1:
-            raise UserError(f"--{name.replace('_', '-')} must be at least 1, not {getattr(args, name)}")
+            raise records.UserError(f"--{name.replace('_', '-')} must be at least 1, not {getattr(args, name)}")
     if args.num_envs * args.num_steps % args.num_minibatches:
-        raise UserError(
+        raise records.UserError(
             f"{args.num_minibatches} minibatches do not divide a rollout of {args.num_envs} environments x "
             f"{args.num_steps} steps = {args.num_envs * args.num_steps}; change --num-minibatches or --num-envs"
         )
@@ -369,20 +362,22 @@ def run_eval(args):
     from envs import render  # matplotlib and OpenGL are slow to load and not needed for training
 
     path = Path(args.eval)
-    params, meta = load(path)
+    params, meta = records.load(path)
     if meta["task"] != args.task:
-        raise UserError(f"{path} is a policy for {meta['task']}, not for {args.task}; pass --task {meta['task']}")
+        raise records.UserError(
+            f"{path} is a policy for {meta['task']}, not for {args.task}; pass --task {meta['task']}"
+        )
     env, show = make_env(args), make_env(args, **envs.TASKS[args.task][0].SHOWCASE)
     net = ActorCritic(tuple(meta["args"]["hidden"]), env.action_dim, meta["args"]["init_std"])
     like = jax.eval_shape(net.init, jax.random.key(0), jnp.zeros(env.obs_dim))
-    check_shapes(path, params, like)
+    records.check_shapes(path, params, like)
     result, _ = jax.jit(lambda p: evaluate(env, net, p, args.eval_envs))(params)
     showcase, qpos = jax.jit(lambda p: evaluate(show, net, p, min(args.eval_envs, 16)))(params)
-    print(f"{args.eval_envs} episodes of {args.task}, mean action:", line(result))
-    print(f"showcase {show.SHOWCASE}:", line(showcase))
+    print(f"{args.eval_envs} episodes of {args.task}, mean action:", records.line(result))
+    print(f"showcase {show.SHOWCASE}:", records.line(showcase))
     report = {"task": result, "showcase": showcase | {"config": show.SHOWCASE}}
     report = jax.tree.map(lambda x: float(x) if isinstance(x, jax.Array) else x, report)
-    write_text(path.with_name("eval.json"), json.dumps(report, indent=1) + "\n")
+    records.replace_text(path.with_name("eval.json"), json.dumps(report, indent=1) + "\n")
     for picture in render.film(show, qpos, path.parent):
         print(f"wrote {picture}")
 
@@ -395,93 +390,7 @@ def make_env(args, **overrides):
     try:
         return envs.make(args.task, args.engine, **overrides)
     except (ValueError, ImportError) as error:
-        raise UserError(str(error)) from None
-
-
-def versions():
-    """What a run must name to be repeatable."""
-    git = subprocess.run(["git", "describe", "--always", "--dirty", "--abbrev=12"], capture_output=True, text=True)
-    return {
-        "commit": git.stdout.strip() or "unknown",
-        "device": str(jax.devices()[0]),
-        "machine": f"{platform.machine()}, {os_cpus()} CPUs",
-        "python": platform.python_version(),
-        "jax": jax.__version__,
-        "mujoco": mujoco.__version__,
-    }
-
-
-def os_cpus():
-    """CPUs this process may use."""
-    import os
-
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-
-
-def write_text(path, text):
-    """Replace a file in one step, so that it is never half-written."""
-    tmp = path.with_name(path.name + ".tmp")
-    tmp.write_text(text)
-    tmp.replace(path)
-
-
-def start_run(args):
-    """Create the run folder with args.json in it. Refuses to overwrite a run without --force."""
-    out = Path(args.run_dir)
-    if (out / "metrics.csv").exists() and not args.force:
-        raise UserError(f"{out} holds a run already; pass --force to overwrite it or --run-dir for another folder")
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        (out / "metrics.csv").unlink(missing_ok=True)
-        write_text(out / "args.json", json.dumps(dataclasses.asdict(args) | {"versions": versions()}, indent=1) + "\n")
-    except OSError as error:
-        raise UserError(f"cannot write to {out}: {error.strerror}") from None
-    return out
-
-
-def save(path, params, args):
-    """Write weights, task and arguments as one msgpack file, in one step."""
-    meta = {"task": args.task, "args": dataclasses.asdict(args), "versions": versions()}
-    blob = flax.serialization.msgpack_serialize(
-        {"params": flax.serialization.to_state_dict(jax.device_get(params)), "meta": json.dumps(meta)}
-    )
-    tmp = path.with_name(path.name + ".tmp")
-    tmp.write_bytes(blob)
-    tmp.replace(path)
-
-
-def load(path):
-    """Read what `save` wrote: params and meta. UserError if the file is missing or is not one of ours."""
-    try:
-        content = flax.serialization.msgpack_restore(path.read_bytes())
-        return content["params"], json.loads(content["meta"])
-    except OSError as error:
-        raise UserError(f"cannot read policy {path}: {error.strerror}") from None
-    except Exception:  # msgpack has no common error class; whatever it says, the file is not a policy
-        raise UserError(f"{path} is not a policy file, or it is damaged") from None
-
-
-def check_shapes(path, params, like):
-    """UserError unless params has the leaves and shapes of `like`."""
-    shapes = [{jax.tree_util.keystr(k): jnp.shape(v) for k, v in jax.tree.leaves_with_path(t)} for t in (params, like)]
-    for name in sorted(shapes[0].keys() | shapes[1].keys()):
-        if shapes[0].get(name) != shapes[1].get(name):
-            raise UserError(f"{path}: {name} is {shapes[0].get(name)}, this task needs {shapes[1].get(name)}")
-
-
-def line(row):
-    """A row of numbers as text."""
-    return "  ".join(f"{name} {float(value):.4g}" for name, value in row.items())
-
-
-def log_row(path, row):
-    """Append one row to a CSV file."""
-    new = not path.exists()
-    with path.open("a", newline="") as file:
-        writer = csv.DictWriter(file, row)
-        if new:
-            writer.writeheader()
-        writer.writerow(row)
+        raise records.UserError(str(error)) from None
 
 
 def make_row(args, iterations, seconds, metrics):
@@ -495,64 +404,6 @@ def make_row(args, iterations, seconds, metrics):
     return {name: float(f"{float(value):.6g}") for name, value in row.items()}
 
 
-def plot_curve(csv_path, out_path):
-    """Draw return, fall rate, task metrics and reward terms over environment steps."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    with csv_path.open() as file:
-        rows = list(csv.DictReader(file))
-    columns = {name: [float(row[name]) for row in rows] for name in rows[0]}
-    names = ["episode_return", "fall_rate", *(name for name in columns if name.endswith("_error")), "action_std"]
-    terms = [name for name in columns if name.startswith("reward/")]
-    fig, axes = plt.subplots(1, len(names) + 1, figsize=(3.2 * (len(names) + 1), 2.8), constrained_layout=True)
-    for ax, name in zip(axes, names, strict=False):
-        ax.plot(columns["env_steps"], columns[name])
-        ax.set_title(name)
-    for name in terms:
-        axes[-1].plot(columns["env_steps"], columns[name], label=name.removeprefix("reward/"), lw=1)
-    axes[-1].set_title("reward terms per step")
-    axes[-1].legend(fontsize=5)
-    for ax in axes:
-        ax.set_xlabel("environment steps")
-        ax.grid(alpha=0.3)
-    fig.savefig(out_path, dpi=110, metadata={"Software": None})
-    plt.close(fig)
-
-
-class Reporter:
-    """Progress: a live bar on a terminal, one plain line a row elsewhere."""
-
-    SHOWN = ("episode_return", "fall_rate", "lin_vel_error", "kl", "action_std")
-
-    def __init__(self, total):
-        self.total, self.bar = total, None
-
-    def __enter__(self):
-        if sys.stdout.isatty():
-            from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
-
-            columns = BarColumn(bar_width=20), TextColumn("{task.percentage:.0f}%"), TimeRemainingColumn()
-            self.bar = Progress(*columns, TextColumn("{task.description}"))
-            self.bar.start()
-            self.task = self.bar.add_task("compiling", total=self.total)
-        return self
-
-    def __exit__(self, *_):
-        if self.bar:
-            self.bar.stop()
-
-    def show(self, row, speed):
-        shown = {name: row[name] for name in self.SHOWN if name in row}
-        text = f"{row['env_steps'] / 1e6:.2f}M steps  {speed:,.0f}/s  {line(shown)}"
-        if self.bar:
-            self.bar.update(self.task, completed=row["iteration"], description=text)
-        else:
-            print(f"{row['seconds']:6.0f} s  {text}", flush=True)
-
-
 # --- Main ---
 
 
@@ -560,7 +411,7 @@ def train(args):
     """Run PPO to the end, or to Ctrl-C; either way the folder holds a policy, the metrics and their curve."""
     env = make_env(args)
     args = merge(args, env.config.ppo)
-    out = start_run(args)
+    out = records.start_run(args)
     print(f"{args.task}: observation {env.obs_dim}, action {env.action_dim}, engine {type(env.engine).__name__}")
     print("  ".join(f"{name}={value}" for name, value in dataclasses.asdict(args).items()), flush=True)
     net = ActorCritic(args.hidden, env.action_dim, args.init_std)
@@ -577,22 +428,22 @@ def train(args):
     print(f"compiled in {time.perf_counter() - start:.1f} s", flush=True)
     start = last = time.perf_counter()
     try:
-        with Reporter(iterations) as reporter:
+        with records.Reporter(iterations) as reporter:
             while int(state.iteration) < iterations:
                 state, metrics = chunk(state)
                 metrics = jax.device_get(metrics)
                 now = time.perf_counter()
                 row = make_row(args, int(state.iteration), now - start, metrics)
-                log_row(out / "metrics.csv", row)
+                records.log_row(out / "metrics.csv", row)
                 reporter.show(row, args.log_every * args.num_envs * args.num_steps / (now - last))
                 last = now
                 if not all(jnp.isfinite(x).all() for x in jax.tree.leaves(state.params)):
-                    raise UserError(f"weights are not finite after iteration {row['iteration']}; lower --lr")
-                save(out / "policy.msgpack", state.params, args)
+                    raise records.UserError(f"weights are not finite after iteration {row['iteration']}; lower --lr")
+                records.save(out / "policy.msgpack", state.params, args)
     except KeyboardInterrupt:
         print("\ninterrupted")
     if (out / "metrics.csv").exists():
-        plot_curve(out / "metrics.csv", out / "curve.png")
+        records.plot_curve(out / "metrics.csv", out / "curve.png")
         print(f"wrote {out}/policy.msgpack, metrics.csv, curve.png")
     return state
 
@@ -601,7 +452,7 @@ def main(args):
     """Train, or evaluate with --eval. UserErrors end in one line and exit code 2."""
     try:
         return run_eval(args) if args.eval else train(args)
-    except UserError as error:
+    except records.UserError as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(2)
 

@@ -55,7 +55,7 @@ def stepping(task, engine, num_envs, length, whole):
 
 
 def training(task, num_envs):
-    """Steps per second of ppo_finetune.py from its second to its last row, its compile time and time to the first row."""
+    """Steps per second of ppo_finetune.py after its first row, its compile time and the time to that row."""
     with tempfile.TemporaryDirectory() as folder:
         command = [sys.executable, "ppo_finetune.py", "--task", task, "--num-envs", str(num_envs), "--run-dir", folder]
         command += ["--total-steps", str(num_envs * 24 * 40)]
@@ -66,7 +66,8 @@ def training(task, num_envs):
                     compile_s = float(text.split()[2])
                 if " steps " in text and to_first is None:
                     to_first = time.perf_counter() - start
-        rows = list(csv.DictReader(open(Path(folder, "metrics.csv"))))
+        with Path(folder, "metrics.csv").open() as file:
+            rows = list(csv.DictReader(file))
         steps, seconds = ([float(row[name]) for row in rows] for name in ("env_steps", "seconds"))
         return (steps[-1] - steps[0]) / (seconds[-1] - seconds[0]), compile_s, to_first
 
@@ -142,7 +143,8 @@ def main():
     (out / "cpu.json").write_text(json.dumps({"machine": machine, "rows": rows}, indent=1) + "\n")
     table = "\n".join(as_text(row) for row in rows)
     facts = ", ".join(f"{name} {value}" for name, value in machine.items())
-    head = f"# Speed\n\nMade by `python results/bench.py` on: {facts}.\n\n| what | task | environments | figure |\n|---|---|---|---|\n"
+    head = f"# Speed\n\nMade by `python results/bench.py` on: {facts}.\n\n"
+    head += "| what | task | environments | figure |\n|---|---|---|---|\n"
     (out / "README.md").write_text(head + table + "\n")
 
 

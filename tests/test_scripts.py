@@ -16,6 +16,7 @@ import pytest
 
 import envs
 import ppo_finetune as script
+from envs import records
 
 ROOT = Path(__file__).resolve().parent.parent
 SMOKE = script.Args(preset="smoke")
@@ -53,7 +54,7 @@ def test_run_folder(trained):
     assert [float(row["env_steps"]) for row in rows] == [32, 64]
     assert {f"reward/{term}" for term in envs.TASKS["g1_loco"][1].weights} <= set(rows[0])
     assert (out / "curve.png").stat().st_size > 5000
-    params, meta = script.load(out / "policy.msgpack")
+    params, meta = records.load(out / "policy.msgpack")
     assert meta["task"] == "g1_loco"
     jax.tree.map(np.testing.assert_array_equal, params, jax.device_get(state.params))
     assert not list(out.glob("*.tmp"))
@@ -175,5 +176,5 @@ def test_interrupt_keeps_the_files(tmp_path):
     assert process.returncode == 0 and "interrupted" in out and "Traceback" not in err, err
     rows = list(csv.DictReader((tmp_path / "metrics.csv").open()))
     assert rows and all(None not in row.values() for row in rows)
-    script.load(tmp_path / "policy.msgpack")
+    records.load(tmp_path / "policy.msgpack")
     assert (tmp_path / "curve.png").exists()

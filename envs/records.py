@@ -1,0 +1,168 @@
+"""Run folders, policy files, progress and curves: what scripts write down, and how they report it.
+
+Every file is replaced in one step, so that a stopped run leaves none half-written.
+"""
+
+import csv
+import dataclasses
+import json
+import os
+import platform
+import subprocess
+import sys
+from pathlib import Path
+
+import flax
+import jax
+import jax.numpy as jnp
+import mujoco
+
+
+class UserError(Exception):
+    """Bad input: printed as one line, exit code 2."""
+
+
+def versions():
+    """What a run must name to be repeatable."""
+    git = subprocess.run(["git", "describe", "--always", "--dirty", "--abbrev=12"], capture_output=True, text=True)
+    return {
+        "commit": git.stdout.strip() or "unknown",
+        "device": str(jax.devices()[0]),
+        "machine": f"{platform.machine()}, {cpu_count()} CPUs",
+        "python": platform.python_version(),
+        "jax": jax.__version__,
+        "mujoco": mujoco.__version__,
+    }
+
+
+def cpu_count():
+    """CPUs this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+
+
+def replace_text(path, text):
+    """Write a whole text file in one step."""
+    tmp = path.with_name(path.name + ".tmp")
+    tmp.write_text(text)
+    tmp.replace(path)
+
+
+def start_run(args):
+    """Create the run folder with args.json in it. Refuses to overwrite a run without --force."""
+    out = Path(args.run_dir)
+    if (out / "metrics.csv").exists() and not args.force:
+        raise UserError(f"{out} holds a run already; pass --force to overwrite it or --run-dir for another folder")
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        (out / "metrics.csv").unlink(missing_ok=True)
+        replace_text(
+            out / "args.json", json.dumps(dataclasses.asdict(args) | {"versions": versions()}, indent=1) + "\n"
+        )
+    except OSError as error:
+        raise UserError(f"cannot write to {out}: {error.strerror}") from None
+    return out
+
+
+def save(path, params, args):
+    """Write weights, task and arguments as one msgpack file, in one step."""
+    meta = {"task": args.task, "args": dataclasses.asdict(args), "versions": versions()}
+    blob = flax.serialization.msgpack_serialize(
+        {"params": flax.serialization.to_state_dict(jax.device_get(params)), "meta": json.dumps(meta)}
+    )
+    tmp = path.with_name(path.name + ".tmp")
+    tmp.write_bytes(blob)
+    tmp.replace(path)
+
+
+def load(path):
+    """Read what `save` wrote: params and meta. UserError if the file is missing or is not one of ours."""
+    try:
+        content = flax.serialization.msgpack_restore(path.read_bytes())
+        meta = json.loads(content["meta"])
+        assert {"task", "args"} <= meta.keys()
+        return content["params"], meta
+    except OSError as error:
+        raise UserError(f"cannot read policy {path}: {error.strerror}") from None
+    except Exception:  # msgpack has no common error class; whatever it says, the file is not a policy
+        raise UserError(f"{path} is not a policy file, or it is damaged") from None
+
+
+def check_shapes(path, params, like):
+    """UserError unless params has the leaves and shapes of `like`."""
+    shapes = [{jax.tree_util.keystr(k): jnp.shape(v) for k, v in jax.tree.leaves_with_path(t)} for t in (params, like)]
+    for name in sorted(shapes[0].keys() | shapes[1].keys()):
+        if shapes[0].get(name) != shapes[1].get(name):
+            raise UserError(f"{path}: {name} is {shapes[0].get(name)}, this task needs {shapes[1].get(name)}")
+
+
+def line(row):
+    """A row of numbers as text."""
+    return "  ".join(f"{name} {float(value):.4g}" for name, value in row.items())
+
+
+def log_row(path, row):
+    """Append one row to a CSV file."""
+    new = not path.exists()
+    with path.open("a", newline="") as file:
+        writer = csv.DictWriter(file, row)
+        if new:
+            writer.writeheader()
+        writer.writerow(row)
+
+
+def plot_curve(csv_path, out_path):
+    """Draw return, fall rate, task metrics and reward terms over environment steps."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    with csv_path.open() as file:
+        rows = list(csv.DictReader(file))
+    columns = {name: [float(row[name]) for row in rows] for name in rows[0]}
+    names = ["episode_return", "fall_rate", *(name for name in columns if name.endswith("_error")), "action_std"]
+    terms = [name for name in columns if name.startswith("reward/")]
+    fig, axes = plt.subplots(1, len(names) + 1, figsize=(3.2 * (len(names) + 1), 2.8), constrained_layout=True)
+    for ax, name in zip(axes, names, strict=False):
+        ax.plot(columns["env_steps"], columns[name])
+        ax.set_title(name)
+    for name in terms:
+        axes[-1].plot(columns["env_steps"], columns[name], label=name.removeprefix("reward/"), lw=1)
+    axes[-1].set_title("reward terms per step")
+    axes[-1].legend(fontsize=5)
+    for ax in axes:
+        ax.set_xlabel("environment steps")
+        ax.grid(alpha=0.3)
+    fig.savefig(out_path, dpi=110, metadata={"Software": None})
+    plt.close(fig)
+
+
+class Reporter:
+    """Progress: a live bar on a terminal, one plain line a row elsewhere."""
+
+    SHOWN = ("episode_return", "fall_rate", "lin_vel_error", "kl", "action_std")
+
+    def __init__(self, total):
+        self.total, self.bar = total, None
+
+    def __enter__(self):
+        if sys.stdout.isatty():
+            from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+            columns = BarColumn(bar_width=20), TextColumn("{task.percentage:.0f}%"), TimeRemainingColumn()
+            self.bar = Progress(*columns, TextColumn("{task.description}"))
+            self.bar.start()
+            self.task = self.bar.add_task("compiling", total=self.total)
+        return self
+
+    def __exit__(self, *_):
+        if self.bar:
+            self.bar.stop()
+
+    def show(self, row, speed):
+        shown = {name: row[name] for name in self.SHOWN if name in row}
+        text = f"{row['env_steps'] / 1e6:.2f}M steps  {speed:,.0f}/s  {line(shown)}"
+        if self.bar:
+            self.bar.update(self.task, completed=row["iteration"], description=text)
+        else:
+            print(f"{row['seconds']:6.0f} s  {text}", flush=True)
