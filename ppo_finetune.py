@@ -1,9 +1,9 @@
-"""Train a robot task with PPO (paper Sec. IV-D).
+"""Train a robot task with PPO (paper Sec. V-A).
 
     python ppo_finetune.py --task go1_loco
     python ppo_finetune.py --task go1_loco --eval runs/go1_loco/mlp/seed0/policy.msgpack
 
-Reads top to bottom: arguments, network, rollout, advantages, loss, update, evaluation, records, main.
+Reads top to bottom: arguments, network, rollout, objective, update, evaluation, records, main.
 The algorithm is that of rsl_rl, which the paper used; where we differ stands `Deviation:`.
 Shapes in comments: T rollout steps, N environments, B minibatch, O observation, A action.
 """
@@ -13,6 +13,7 @@ import json
 import sys
 import time
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -26,7 +27,7 @@ import tyro
 import envs
 from envs import records
 
-jax.config.update("jax_default_matmul_precision", "highest")  # TF32 changes what is learned
+jax.config.update("jax_default_matmul_precision", "highest")  # TF32 of recent GPUs changes what is learned
 
 
 @dataclass(frozen=True)
@@ -36,7 +37,7 @@ class Args:
     # --- Run ---
     task: str = "go1_loco"  # a name in envs.TASKS
     network: Literal["mlp"] = "mlp"  # actor and critic: a plain MLP
-    preset: Literal["smoke", "cpu", "gpu"] = "cpu"  # scale: smoke 4 environments, cpu 256 or 512, gpu 4096
+    preset: Literal["smoke", "cpu", "gpu"] = "cpu"  # scale: smoke 4 environments, cpu 256, gpu 4096
     seed: int = 0  # the only source of randomness
     engine: str = "auto"  # physics: c (CPU threads), mjx (accelerators), auto
     run_dir: str | None = None  # None: runs/<task>/<network>/seed<seed>
@@ -251,6 +252,15 @@ def mirror_loss(env, net, params, obs, mean, key):
     return jnp.mean((mirrored - jax.lax.stop_gradient(mean)[:, act_perm] * act_sign) ** 2)
 
 
+def loss_with_mirror(args, env, net, params, log_std_old, batch, key):
+    """What a minibatch step descends: PPO's loss, plus the mirror loss where the robot has a symmetry."""
+    loss, mean, metrics = ppo_loss(args, net, params, log_std_old, *batch)
+    if args.mirror_coef and env.mirrors:
+        metrics["mirror_loss"] = mirror_loss(env, net, params, batch[0].obs, mean, key)
+        loss += args.mirror_coef * metrics["mirror_loss"]
+    return loss, metrics
+
+
 # --- Update ---
 
 
@@ -280,13 +290,7 @@ def update(args, env, net, opt, state, roll, advantage, ret, key):
         params, opt_state, lr = carry
         batch, key = inputs
 
-        def objective(params):
-            loss, mean, metrics = ppo_loss(args, net, params, log_std_old, *batch)
-            if args.mirror_coef and env.mirrors:
-                metrics["mirror_loss"] = mirror_loss(env, net, params, batch[0].obs, mean, key)
-                loss += args.mirror_coef * metrics["mirror_loss"]
-            return loss, metrics
-
+        objective = partial(loss_with_mirror, args, env, net, log_std_old=log_std_old, batch=batch, key=key)
         grads, metrics = jax.grad(objective, has_aux=True)(params)
         lr = adapt_lr(args, lr, metrics["kl"])
         grads, (metrics["actor_grad_norm"], metrics["critic_grad_norm"]) = clip_gradients(args, grads)
@@ -411,7 +415,7 @@ def train(args):
     """Run PPO to the end, or to Ctrl-C; either way the folder holds a policy, the metrics and their curve."""
     env = make_env(args)
     args = merge(args, env.config.ppo)
-    out = records.start_run(args)
+    out = records.start_run(args, args.run_dir, args.force)
     print(f"{args.task}: observation {env.obs_dim}, action {env.action_dim}, engine {type(env.engine).__name__}")
     print("  ".join(f"{name}={value}" for name, value in dataclasses.asdict(args).items()), flush=True)
     net = ActorCritic(args.hidden, env.action_dim, args.init_std)

@@ -230,7 +230,8 @@ class Env:
         key, k_sense, k_task, k_push, k_reset = jax.random.split(state.key, 5)
         physics = self.engine.step(state.physics, self.default_pose + self.robot.action_scale * action)
         healthy = jnp.all(jnp.abs(physics.qpos) < BLOWN_UP) & jnp.all(jnp.abs(physics.qvel) < BLOWN_UP)  # false for NaN
-        physics = select(healthy, physics, state.physics)  # a diverged robot must not poison the batch
+        fresh = self.reset(k_reset)
+        physics = select(healthy, physics, fresh.physics)  # a diverged robot must not poison the batch
 
         # rewards and termination, on the true state
         motion = self.motion(physics)
@@ -266,7 +267,6 @@ class Env:
             key=key,
             task=task,
         )
-        fresh = self.reset(k_reset)
         return select(terminated | truncated, fresh, stepped).replace(
             reward=reward,
             terminated=terminated,

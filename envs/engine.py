@@ -13,8 +13,6 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from mujoco import mjx
-from mujoco.mjx._src import support as mjx_support  # contact_force_dim has no public name; mujoco-mjx is pinned
 
 
 @flax.struct.dataclass
@@ -143,6 +141,10 @@ class MjxEngine(Engine):
 
     def __init__(self, spec, decimation):
         super().__init__(spec, decimation)
+        from mujoco import mjx  # here, because it is slow to import and prints what it did not find
+        from mujoco.mjx._src import support  # contact_force_dim has no public name; mujoco-mjx is pinned
+
+        self.mjx, self.contact_force_dim = mjx, support.contact_force_dim
         self.touching = self.contact_sensors()  # (contact sensors, ngeom)
         spec = spec.copy()
         for sensor in [s for s in spec.sensors if s.type == mujoco.mjtSensor.mjSENS_CONTACT]:
@@ -163,6 +165,7 @@ class MjxEngine(Engine):
 
     def step(self, physics, ctrl):
         """Advance by `decimation` physics steps with joint targets ctrl (nu,) [rad]."""
+        mjx = self.mjx
         fields = self.randomised(jnp, physics.friction, physics.mass_scale)
         model = self.mjx_model.tree_replace(fields)
         data = self.mjx_data.replace(
@@ -190,7 +193,7 @@ class MjxEngine(Engine):
     def net_forces(self, model, data):
         """Net contact force on each contact sensor's geoms, world frame, (sensors, 3) [N]."""
         contact = data._impl.contact
-        force, index = mjx_support.contact_force_dim(model, data, 3)  # in the contact frame
+        force, index = self.contact_force_dim(model, data, 3)  # in the contact frame
         world = jnp.einsum("cij,ci->cj", contact.frame[index], force[:, :3])
         one, two = contact.geom[index].T
         touching = jnp.asarray(self.touching)

@@ -226,6 +226,8 @@ GO1_LOCO = LocomotionConfig(
     added_mass=(-1.0, 3.0),
 )
 
+G1_PARTS = ("thigh", "shin", "upperarm", "forearm", "hand")
+
 G1_LOCO = LocomotionConfig(
     robot="g1",
     weights={
@@ -256,6 +258,7 @@ G1_LOCO = LocomotionConfig(
     lin_vel_x=(0.0, 1.0),
     lin_vel_y=(-0.5, 0.5),
     effort_joints=("hip", "knee"),
-    contact_ends=("torso", "pelvis"),
+    # Deviation: any part but the feet ends the episode, not the torso alone: else the robot learns to sit.
+    contact_ends=("torso", "pelvis", *(f"{side}_{part}" for side in ("left", "right") for part in G1_PARTS)),
     max_tilt=70.0,
 )

