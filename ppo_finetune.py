@@ -415,7 +415,7 @@ def train(args):
     """Run PPO to the end, or to Ctrl-C; either way the folder holds a policy, the metrics and their curve."""
     env = make_env(args)
     args = merge(args, env.config.ppo)
-    out = records.start_run(args, args.run_dir, args.force)
+    out = records.start_run(args, env.config, args.run_dir, args.force)
     print(f"{args.task}: observation {env.obs_dim}, action {env.action_dim}, engine {type(env.engine).__name__}")
     print("  ".join(f"{name}={value}" for name, value in dataclasses.asdict(args).items()), flush=True)
     net = ActorCritic(args.hidden, env.action_dim, args.init_std)

@@ -47,12 +47,15 @@ def replace_text(path, text):
     tmp.replace(path)
 
 
-def start_run(args, folder, force):
-    """Create the run folder with args.json in it and return it. Refuses to overwrite a run unless `force`."""
+def start_run(args, config, folder, force):
+    """Create the run folder with args.json in it and return it. Refuses to overwrite a run unless `force`.
+
+    args and config (the task's) are dataclasses; both are recorded, with versions, commit and device.
+    """
     out = Path(folder)
     if (out / "metrics.csv").exists() and not force:
         raise UserError(f"{out} holds a run already; pass --force to overwrite it or --run-dir for another folder")
-    record = dataclasses.asdict(args) | {"versions": versions()}
+    record = dataclasses.asdict(args) | {"config": dataclasses.asdict(config), "versions": versions()}
     try:
         out.mkdir(parents=True, exist_ok=True)
         (out / "metrics.csv").unlink(missing_ok=True)
