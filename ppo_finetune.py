@@ -274,7 +274,7 @@ def clip_gradients(args, grads):
     """Scale the gradients of actor (with std) and critic to a norm of at most max_grad_norm, each on its own."""
     critic = {"critic": grads["params"]["critic"]}
     actor = {name: g for name, g in grads["params"].items() if name != "critic"}
-    norms = [optax.global_norm(part) for part in (actor, critic)]
+    norms = [optax.tree.norm(part) for part in (actor, critic)]
     scales = [jnp.minimum(1.0, args.max_grad_norm / (norm + 1e-6)) for norm in norms]
     parts = [jax.tree.map(lambda g: g * scale, part) for part, scale in zip((actor, critic), scales, strict=True)]
     return {"params": parts[0] | parts[1]}, jnp.stack(norms)
@@ -445,7 +445,7 @@ def train(args):
                     raise records.UserError(f"weights are not finite after iteration {row['iteration']}; lower --lr")
                 records.save(out / "policy.msgpack", state.params, args)
     except KeyboardInterrupt:
-        print("\ninterrupted")
+        print("\ninterrupted", flush=True)
     if (out / "metrics.csv").exists():
         records.plot_curve(out / "metrics.csv", out / "curve.png")
         print(f"wrote {out}/policy.msgpack, metrics.csv, curve.png")
@@ -459,6 +459,8 @@ def main(args):
     except records.UserError as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(2)
+    except KeyboardInterrupt:  # before the first row: nothing to save yet
+        sys.exit("interrupted")
 
 
 if __name__ == "__main__":

@@ -91,6 +91,11 @@ class CEngine(Engine):
 
     def __init__(self, spec, decimation):
         super().__init__(spec, decimation)
+        try:
+            from mujoco.batch import Batch  # new in MuJoCo 3.17
+        except ImportError:
+            raise ImportError(f"engine c needs mujoco >= 3.17, this is {mujoco.__version__}") from None
+        self.make_batch = Batch
         self.batches = {}  # number of simulations -> Batch
         self.lock = threading.Lock()  # a Batch must not be entered twice
 
@@ -128,9 +133,7 @@ class CEngine(Engine):
     def batch(self, count):
         """The Batch of `count` simulations, made once, its outputs bound so that they are copied out."""
         if count not in self.batches:
-            from mujoco.batch import Batch  # here, so that other engines run where it is missing
-
-            self.batches[count] = Batch(self.model, count)
+            self.batches[count] = self.make_batch(self.model, count)
             for name in self.OUTPUTS:
                 self.batches[count].bind(self.MUJOCO.get(name, name))
         return self.batches[count]
@@ -141,8 +144,11 @@ class MjxEngine(Engine):
 
     def __init__(self, spec, decimation):
         super().__init__(spec, decimation)
-        from mujoco import mjx  # here, because it is slow to import and prints what it did not find
-        from mujoco.mjx._src import support  # contact_force_dim has no public name; mujoco-mjx is pinned
+        try:  # here, because it is slow to import and prints what it did not find
+            from mujoco import mjx
+            from mujoco.mjx._src import support  # contact_force_dim has no public name; mujoco-mjx is pinned
+        except ImportError:
+            raise ImportError("engine mjx needs the package mujoco-mjx, of the version of mujoco") from None
 
         self.mjx, self.contact_force_dim = mjx, support.contact_force_dim
         self.touching = self.contact_sensors()  # (contact sensors, ngeom)

@@ -1,6 +1,7 @@
 """The environment contract: history, resets, time limits, noise, randomisation, mirrors, broken simulations."""
 
 import dataclasses
+import sys
 
 import jax
 import jax.numpy as jnp
@@ -321,6 +322,14 @@ def test_wrong_names_are_listed():
         envs.make("go1_loco", "bullet")
     with pytest.raises(ValueError, match="unknown option 'gravity'; choose one of"):
         envs.make("go1_loco", gravity=0)
+
+
+@pytest.mark.parametrize(("engine", "module"), [("mjx", "mujoco.mjx"), ("c", "mujoco.batch")])
+def test_missing_package_is_named(monkeypatch, engine, module):
+    monkeypatch.setitem(sys.modules, module, None)
+    monkeypatch.delattr(mujoco, module.split(".")[1], raising=False)
+    with pytest.raises(ImportError, match=f"engine {engine} needs"):
+        envs.make("go1_loco", engine)
 
 
 def test_auto_engine_on_a_cpu():

@@ -113,7 +113,7 @@ def test_pictures_without_opengl(trained, tmp_path):
     """Where no OpenGL works the same files are drawn by matplotlib."""
     target = tmp_path / "policy.msgpack"
     target.write_bytes((trained[0] / "policy.msgpack").read_bytes())
-    environ = os.environ | {"MUJOCO_GL": "nothing"}
+    environ = os.environ | {"MUJOCO_GL": "disable"}
     process = run("--task", "g1_loco", "--eval", target, "--eval-envs", 2, env=environ)
     assert process.returncode == 0, process.stderr
     assert "stick figures" in process.stdout and (tmp_path / "rollout.png").stat().st_size > 5000
