@@ -22,7 +22,7 @@ class LocomotionConfig(Config):
     yaw_rate: float = 1.0  # [rad/s] half-width of the turning command
     command_seconds: float = 10.0  # a new command comes this often
     standing: float = 0.02  # share of commands that ask to stand still
-    fixed_command: tuple[float, float, float] | None = None  # vx, vy, yaw rate for all; for evaluation
+    fixed_velocity: tuple[float, float] | None = None  # [m/s] vx, vy along the world's x for all; for evaluation
     air_time_threshold: float = 0.5  # [s]
     effort_joints: tuple[str, ...] = ("",)  # name parts of the joints whose torque and acceleration are punished
     contact_ends: tuple[str, ...] = ("base",)  # sensors <name>_force whose contact is a failure
@@ -53,7 +53,7 @@ class Locomotion(Env):
         "action": ("joint", 0.5),
     }
 
-    SHOWCASE = {"fixed_command": (0.8, 0.0, 0.0), "spawn_yaw": 0.0, "spawn_xy": 0.0}
+    SHOWCASE = {"fixed_velocity": (0.8, 0.0), "spawn_yaw": 0.0, "spawn_xy": 0.0}
 
     def __init__(self, config, engine="auto"):
         super().__init__(config, engine)
@@ -70,14 +70,14 @@ class Locomotion(Env):
     def draw_command(self, key):
         """A new command (3,), heading () and whether it moves at all."""
         c = self.config
+        if c.fixed_velocity is not None:
+            return jnp.array([*c.fixed_velocity, 0.0]), jnp.zeros(()), jnp.ones((), bool)
         k_x, k_y, k_heading, k_stand = jax.random.split(key, 4)
         command = jnp.stack([uniform(k_x, *c.lin_vel_x), uniform(k_y, *c.lin_vel_y), 0.0])
         return command, uniform(k_heading, -jnp.pi, jnp.pi), uniform(k_stand, 0.0, 1.0) >= c.standing
 
     def steer(self, task, yaw):
         """Turn towards the heading; stand if the command says so."""
-        if self.config.fixed_command is not None:
-            return task.replace(command=jnp.array(self.config.fixed_command))
         turn = jnp.clip(0.5 * wrap(task.heading - yaw), -self.config.yaw_rate, self.config.yaw_rate)
         return task.replace(command=jnp.where(task.moves, task.command.at[2].set(turn), 0.0))
 
