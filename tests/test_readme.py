@@ -1,5 +1,7 @@
 """What the README tells people to type works: commands parse, targets and files exist, Python runs."""
 
+import csv
+import json
 import re
 import shlex
 from pathlib import Path
@@ -43,3 +45,24 @@ def test_links_lead_somewhere():
 
 def test_every_task_is_in_the_table():
     assert all(f"| `{task}` |" in README for task in envs.TASKS)
+
+
+@pytest.mark.parametrize("task", envs.TASKS)
+def test_task_table_is_what_was_recorded(task):
+    """Scale, minutes, velocity error and falls in the README are those of the committed run."""
+    run = ROOT / "results/loco" / task
+    args, report = (json.loads((run / name).read_text()) for name in ("args.json", "eval.json"))
+    with (run / "metrics.csv").open() as file:
+        last = list(csv.DictReader(file))[-1]
+    scale = f"{args['num_envs']} x {args['num_steps']}, {float(last['env_steps']) / 1e6:.1f} M steps"
+    minutes, result = float(last["seconds"]) / 60, report["task"]
+    figures = f"{minutes:.1f} min, {result['lin_vel_error']:.2f} m/s, {100 * result['falls']:.0f}%"
+    row = next(line for line in README.splitlines() if line.startswith(f"| `{task}` |"))
+    assert row.endswith(f"| {scale} | {figures} |")
+
+
+def test_speed_table_is_what_was_measured():
+    section = README.split("## Speed")[1].split("\n## ")[0]
+    rows = [line for line in section.splitlines() if line.endswith((" steps/s |", " x |", " s |"))]
+    measured = (ROOT / "results/bench/README.md").read_text().splitlines()
+    assert len(rows) > 5 and set(rows) <= set(measured)
