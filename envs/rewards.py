@@ -33,6 +33,11 @@ def single_stance(air_time, contact_time, command):
     return jnp.where(jnp.sum(contact) == 1, jnp.minimum(jnp.min(phase), 0.4), 0.0) * moving(command)
 
 
+def flight(contact, command):
+    """1 while no foot is on the ground although the command moves: a hop, where a walk is wanted; contact (F,)."""
+    return jnp.all(~contact) * moving(command)
+
+
 def moving(command):
     """1 if the command asks for more than 0.1 m/s, else 0: standing still must not be punished for lack of steps."""
     return jnp.linalg.norm(command[:2]) > 0.1
