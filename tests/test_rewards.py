@@ -49,8 +49,10 @@ def reference(env, physics, task, action, last_action):
         "torque": sum(tau[j] ** 2 for j in effort),
         "joint_acc": sum(acc[j] ** 2 for j in effort),
         "action_rate": sum((a - b) ** 2 for a, b in zip(action, last_action, strict=True)),
+        "pose": sum((q[j] - home[j]) ** 2 for j in robot.joints),
         "alive": 1.0,
     }
+    terms["slip"] = sum(np.hypot(*read(f"{f}_vel")[:2]) for f, on in zip(robot.feet, contact, strict=True) if on)
     if robot.name != "g1":
         threshold = TASKS[{"anymal_d": "anymal_loco", "go1": "go1_loco"}[robot.name]]["air_threshold"]
         terms["air_time"] = moving * sum(t - threshold for t in task.landed_after if t > 0)
@@ -67,7 +69,6 @@ def reference(env, physics, task, action, last_action):
         phase = [c if on else a for a, c, on in zip(task.air_time, task.contact_time, contact, strict=True)]
         terms["flight"] = moving * (sum(contact) == 0)
         terms["single_stance"] = moving * (sum(contact) == 1) * min(*phase, 0.4)
-        terms["slip"] = sum(np.hypot(*read(f"{f}_vel")[:2]) for f, on in zip(robot.feet, contact, strict=True) if on)
         limit = 0.0
         for joint in (j for j in robot.joints if "ankle" in j):
             low, high = model.joint(joint).range
