@@ -431,24 +431,22 @@ def train(args):
     chunk = train_chunk.lower(state).compile()
     print(f"compiled in {time.perf_counter() - start:.1f} s", flush=True)
     start = last = time.perf_counter()
-    try:
-        with records.Reporter(iterations) as reporter:
-            while int(state.iteration) < iterations:
-                state, metrics = chunk(state)
-                metrics = jax.device_get(metrics)
-                now = time.perf_counter()
-                row = make_row(args, int(state.iteration), now - start, metrics)
-                records.log_row(out / "metrics.csv", row)
-                reporter.show(row, args.log_every * args.num_envs * args.num_steps / (now - last))
-                last = now
-                if not all(jnp.isfinite(x).all() for x in jax.tree.leaves(state.params)):
-                    raise records.UserError(f"weights are not finite after iteration {row['iteration']}; lower --lr")
-                records.save(out / "policy.msgpack", state.params, args)
-    except KeyboardInterrupt:
-        print("\ninterrupted", flush=True)
-    if (out / "metrics.csv").exists():
-        records.plot_curve(out / "metrics.csv", out / "curve.png")
-        print(f"wrote {out}/policy.msgpack, metrics.csv, curve.png")
+    with records.Reporter(iterations) as reporter:
+        while int(state.iteration) < iterations and not reporter.stopped:
+            state, metrics = chunk(state)
+            metrics = jax.device_get(metrics)
+            now = time.perf_counter()
+            row = make_row(args, int(state.iteration), now - start, metrics)
+            records.log_row(out / "metrics.csv", row)
+            reporter.show(row, args.log_every * args.num_envs * args.num_steps / (now - last))
+            last = now
+            if not all(jnp.isfinite(x).all() for x in jax.tree.leaves(state.params)):
+                raise records.UserError(f"weights are not finite after iteration {row['iteration']}; lower --lr")
+            records.save(out / "policy.msgpack", state.params, args)
+    if reporter.stopped:
+        print("interrupted")
+    records.plot_curve(out / "metrics.csv", out / "curve.png")
+    print(f"wrote {out}/policy.msgpack, metrics.csv, curve.png")
     return state
 
 

@@ -14,6 +14,10 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+# A callback reads its arguments on the threads that also run the computation waiting for it: with asynchronous
+# dispatch the two lock each other up once arguments are large (jax-ml/jax#24255; seen with 512 G1). Set before JAX starts.
+jax.config.update("jax_cpu_enable_async_dispatch", False)
+
 
 @flax.struct.dataclass
 class Physics:

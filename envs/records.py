@@ -8,6 +8,7 @@ import dataclasses
 import json
 import os
 import platform
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -140,14 +141,18 @@ def plot_curve(csv_path, out_path):
 
 
 class Reporter:
-    """Progress: a live bar on a terminal, one plain line a row elsewhere."""
+    """Progress: a live bar on a terminal, one plain line a row elsewhere. Ctrl-C sets `stopped`, to end after a row."""
 
     SHOWN = ("episode_return", "fall_rate", "lin_vel_error", "kl", "action_std")
 
     def __init__(self, total):
-        self.total, self.bar = total, None
+        self.total, self.bar, self.stopped = total, None, False
+
+    def stop(self, *_):
+        self.stopped = True  # an exception could strike inside the physics callback
 
     def __enter__(self):
+        self.handler = signal.signal(signal.SIGINT, self.stop)
         if sys.stdout.isatty():
             from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -158,6 +163,7 @@ class Reporter:
         return self
 
     def __exit__(self, *_):
+        signal.signal(signal.SIGINT, self.handler)
         if self.bar:
             self.bar.stop()
 
