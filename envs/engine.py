@@ -15,7 +15,8 @@ import mujoco
 import numpy as np
 
 # A callback reads its arguments on the threads that also run the computation waiting for it: with asynchronous
-# dispatch the two lock each other up once arguments are large (jax-ml/jax#24255; seen with 512 G1). Set before JAX starts.
+# dispatch the two lock each other up once arguments are large (jax-ml/jax#24255; seen with 512 G1).
+# This must be set before JAX starts.
 jax.config.update("jax_cpu_enable_async_dispatch", False)
 
 
