@@ -7,7 +7,7 @@ import pytest
 import envs
 
 TASKS = {
-    "anymal_loco": {"thigh": True, "air_threshold": 0.5},
+    "anymal_loco": {"thigh": True, "air_threshold": 0.1},
     "go1_loco": {"thigh": False, "air_threshold": 0.1},
     "g1_loco": {"thigh": False, "air_threshold": None},
 }
