@@ -1,11 +1,13 @@
-"""Train a robot task with PPO (paper Sec. V-A).
+"""Stage 3: learn a robot task with PPO, from a pretrained PIDM or from nothing (paper Sec. III-E and IV).
 
+    python ppo_finetune.py --task g1_loco --pretrained assets/pidm/g1.msgpack
     python ppo_finetune.py --task go1_loco
     python ppo_finetune.py --task go1_loco --eval runs/go1_loco/mlp/seed0/policy.msgpack
 
-Reads top to bottom: arguments, network, rollout, objective, update, evaluation, records, main.
+Reads top to bottom: arguments, networks, warm start, rollout, objective, update, evaluation, records, main.
 The algorithm is that of rsl_rl, which the paper used; where we differ stands `Deviation:`.
-Shapes in comments: T rollout steps, N environments, B minibatch, O observation, A action.
+Shapes in comments: T rollout steps, N environments, B minibatch, O observation, X proprioception x_t, A action,
+K history.
 """
 
 import dataclasses
@@ -27,6 +29,7 @@ import tyro
 import envs
 from envs import records
 
+SHIPPED = Path(__file__).parent / "assets/pidm"  # <robot>.msgpack: pretrained weights and input scaling
 jax.config.update("jax_default_matmul_precision", "highest")  # TF32 of recent GPUs changes what is learned
 
 
@@ -36,11 +39,13 @@ class Args:
 
     # --- Run ---
     task: str = "go1_loco"  # a name in envs.TASKS
-    network: Literal["mlp"] = "mlp"  # actor and critic: a plain MLP
+    network: Literal["mlp", "pidm"] | None = None  # of actor and critic; None: pidm with --pretrained, else mlp
+    pretrained: str | None = None  # PIDM checkpoint of pretrain_pidm.py; None: a PIDM starts from random weights
+    init: Literal["both", "actor", "critic", "shuffled"] = "both"  # what is loaded; shuffled: see `shuffle`
     preset: Literal["smoke", "cpu", "gpu"] = "cpu"  # scale: smoke 4 environments, cpu 256, gpu 4096
     seed: int = 0  # the only source of randomness
     engine: str = "auto"  # physics: c (CPU threads), mjx (accelerators), auto
-    run_dir: str | None = None  # None: runs/<task>/<network>/seed<seed>
+    run_dir: str | None = None  # None: runs/<task>/<method>/seed<seed>
     force: bool = False  # overwrite the run in that folder
     log_every: int | None = None  # iterations per jitted chunk and CSV row
     # --- Evaluation ---
@@ -51,7 +56,7 @@ class Args:
     num_steps: int | None = None  # T, per iteration and environment
     total_steps: int | None = None  # environment steps of the whole run
     # --- Network (tasks' own tables) ---
-    hidden: tuple[int, ...] | None = None  # widths of the hidden layers
+    hidden: tuple[int, ...] | None = None  # widths of the MLP's hidden layers
     init_std: float | None = None  # initial action std, in action units
     # --- PPO (rsl_rl) ---
     num_epochs: int = 5  # passes over each rollout
@@ -74,31 +79,63 @@ PRESETS = {
 }
 
 
+COUNTS = ("num_envs", "num_steps", "total_steps", "log_every", "num_epochs", "num_minibatches", "eval_envs")
+
+
+def method_name(args):
+    """mlp, pidm_random, pidm_pretrained, or pidm_<what is loaded>."""
+    if args.network == "mlp":
+        return "mlp"
+    loaded = "pretrained" if args.init == "both" else args.init
+    return f"pidm_{loaded if args.pretrained else 'random'}"
+
+
 def merge(args, ppo):
-    """Fill what is None in args from the preset, then from the task's own settings `ppo`; check the sizes."""
+    """Fill what is None in args from the preset, then from the task's own settings `ppo`; check them."""
+    if args.network is None:
+        args = dataclasses.replace(args, network="pidm" if args.pretrained else "mlp")
+    if args.pretrained and args.network == "mlp":
+        raise records.UserError("--pretrained loads a PIDM; leave out --network mlp")
+    if args.init != "both" and not args.pretrained:
+        raise records.UserError(f"--init {args.init} needs --pretrained CHECKPOINT")
     values = PRESETS[args.preset] | ppo.get(args.preset, {})
     values |= {"hidden": ppo["hidden"], "init_std": ppo["init_std"], "entropy_coef": ppo["entropy"]}
-    values |= {"run_dir": f"runs/{args.task}/{args.network}/seed{args.seed}"}
+    values |= {"run_dir": f"runs/{args.task}/{method_name(args)}/seed{args.seed}"}
     args = dataclasses.replace(args, **{name: v for name, v in values.items() if getattr(args, name) is None})
-    for name in ("num_envs", "num_steps", "total_steps", "log_every", "num_epochs", "num_minibatches", "eval_envs"):
-        if getattr(args, name) < 1:
-            raise records.UserError(f"--{name.replace('_', '-')} must be at least 1, not {getattr(args, name)}")
-    if args.num_envs * args.num_steps % args.num_minibatches:
-        raise records.UserError(
-            f"{args.num_minibatches} minibatches do not divide a rollout of {args.num_envs} environments x "
-            f"{args.num_steps} steps = {args.num_envs * args.num_steps}; change --num-minibatches or --num-envs"
-        )
+    records.check_positive(args, COUNTS)
+    records.check_minibatches(args)
     return args
 
 
-# --- Network ---
+# --- Networks ---
+
+
+# >>> copy: networks (owner: pretrain_pidm.py)
+CORE = ("history_encoder", "backbone")  # what a pretrained PIDM hands to actor and critic
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """Widths of the PIDM's parts: all the layers of each, but for the head's output (ours; the paper gives counts)."""
+
+    history: tuple[int, ...] = (128, 64)
+    goal: tuple[int, ...] = (64, 32)
+    backbone: tuple[int, ...] = (192, 192, 192, 64)
+    head: tuple[int, ...] = (64,)
+
+
+SIZES = {
+    "anymal_d": Sizes(),
+    "go1": Sizes(),
+    "g1": Sizes(history=(224, 96), goal=(96, 32), backbone=(224, 224, 224, 64)),
+}
 
 
 class MLP(nn.Module):
     """Dense layers with ELU between them; the last one is linear, its weights scaled by `gain`."""
 
     widths: tuple[int, ...]
-    gain: float
+    gain: float = 2**0.5
 
     @nn.compact
     def __call__(self, x):
@@ -107,27 +144,182 @@ class MLP(nn.Module):
         return nn.Dense(self.widths[-1], kernel_init=nn.initializers.orthogonal(self.gain))(x)
 
 
+class PIDM(nn.Module):
+    """Proprioceptive inverse dynamics model (paper Sec. III-D, Fig. 3): history and a goal to an action.
+
+    In pretraining the goal is the wanted change of x and goes through a delta_encoder to a prediction_decoder. In
+    actor and critic the two ends have other names, are fresh, and the head also sees the embedded goal.
+    """
+
+    sizes: Sizes
+    out_dim: int
+    goal: str = "delta_encoder"
+    head: str = "prediction_decoder"
+    goal_to_head: bool = False
+    gain: float = 1.0  # of the last layer
+
+    @nn.compact
+    def __call__(self, history, goal):
+        """history (..., (K+1) X + K A) and goal (..., G), both of order one -> (..., out_dim)."""
+        z_history = nn.elu(MLP(self.sizes.history, name="history_encoder")(history))
+        z_goal = nn.elu(MLP(self.sizes.goal, name=self.goal)(goal))
+        z = nn.elu(MLP(self.sizes.backbone, name="backbone")(jnp.concatenate([z_history, z_goal], -1)))
+        z = jnp.concatenate([z, z_goal], -1) if self.goal_to_head else z
+        return MLP((*self.sizes.head, self.out_dim), self.gain, name=self.head)(z)
+
+
+def standardise(norm, name, x):
+    """(x - mean) / std, within 5; norm holds <name>_mean and <name>_std, fixed for a robot."""
+    return jnp.clip((x - norm[f"{name}_mean"]) / norm[f"{name}_std"], -5.0, 5.0)
+
+
+def flat_history(norm, prop, action):
+    """prop (..., K+1, X) and action (..., K, A), oldest first -> the PIDM's history input (..., (K+1) X + K A)."""
+    parts = standardise(norm, "prop", prop), standardise(norm, "action", action)
+    return jnp.concatenate([part.reshape(*part.shape[:-2], -1) for part in parts], -1)
+
+
+# <<< copy: networks
+
+
+# >>> copy: actor_critic (owner: ppo_finetune.py)
 class ActorCritic(nn.Module):
-    """Gaussian policy with a state-independent std, and value function; separate networks of equal widths."""
+    """Gaussian policy with a state-independent std, and value function; separate MLPs of equal widths."""
 
     hidden: tuple[int, ...]
     action_dim: int
     init_std: float
+    reads = ("obs",)  # its inputs
 
     def setup(self):
         self.actor = MLP((*self.hidden, self.action_dim), gain=0.01)  # the first actions are ~0
         self.critic = MLP((*self.hidden, 1), gain=0.05)
         self.log_std = self.param("log_std", nn.initializers.constant(jnp.log(self.init_std)), (self.action_dim,))
 
-    def __call__(self, obs):
-        """(..., O) -> mean (..., A), log_std (A,), value (...)."""
-        return self.actor(obs), self.log_std, self.value(obs)
+    def __call__(self, inputs):
+        """inputs["obs"] (..., O) -> mean (..., A), log_std (A,), value (...)."""
+        return self.mean(inputs), self.log_std, self.value(inputs)
 
-    def mean(self, obs):
-        return self.actor(obs)
+    def mean(self, inputs):
+        return self.actor(inputs["obs"])
 
-    def value(self, obs):
-        return self.critic(obs).squeeze(-1)
+    def value(self, inputs):
+        return self.critic(inputs["obs"]).squeeze(-1)
+
+
+def net_inputs(net, obs, history):
+    """What a network reads: obs, and the history (prop, action) if it has a PIDM."""
+    return {name: array for name, array in ({"obs": obs} | history).items() if name in net.reads}
+
+
+# <<< copy: actor_critic
+
+
+class PIDMActorCritic(nn.Module):
+    """Actor and critic each around a PIDM core of their own (paper Sec. III-E, Fig. 3).
+
+    The intention encoder reads the task's observation in place of the wanted change of x, and a synthesizer replaces
+    the prediction decoder. Both are fresh in every run; history_encoder and backbone may be loaded by `warm_start`.
+    """
+
+    sizes: Sizes
+    prop_dim: int
+    action_dim: int
+    init_std: float
+    reads = ("obs", "prop", "action")
+
+    def setup(self):
+        ends = {"goal": "intention_encoder", "goal_to_head": True}
+        self.actor = PIDM(self.sizes, self.action_dim, head="action_synthesizer", gain=0.01, **ends)
+        self.critic = PIDM(self.sizes, 1, head="value_synthesizer", gain=0.05, **ends)
+        self.log_std = self.param("log_std", nn.initializers.constant(jnp.log(self.init_std)), (self.action_dim,))
+        for name, width in (("prop", self.prop_dim), ("action", self.action_dim)):
+            setattr(self, f"{name}_mean", self.variable("normalizer", f"{name}_mean", jnp.zeros, width))
+            setattr(self, f"{name}_std", self.variable("normalizer", f"{name}_std", jnp.ones, width))
+
+    def __call__(self, inputs):
+        """inputs obs (..., O), prop (..., K+1, X), action (..., K, A) -> mean (..., A), log_std (A,), value (...)."""
+        return self.mean(inputs), self.log_std, self.value(inputs)
+
+    def mean(self, inputs):
+        return self.actor(self.history(inputs), inputs["obs"])
+
+    def value(self, inputs):
+        return self.critic(self.history(inputs), inputs["obs"]).squeeze(-1)
+
+    def history(self, inputs):
+        """Both histories standardised and flattened (..., (K+1) X + K A)."""
+        names = "prop_mean", "prop_std", "action_mean", "action_std"
+        norm = {name: jax.lax.stop_gradient(getattr(self, name).value) for name in names}
+        return flat_history(norm, inputs["prop"], inputs["action"])
+
+
+def make_net(args, env):
+    """The network that the arguments name, for this environment."""
+    if args.network == "mlp":
+        return ActorCritic(args.hidden, env.action_dim, args.init_std)
+    return PIDMActorCritic(SIZES[env.robot.name], env.prop_dim, env.action_dim, args.init_std)
+
+
+# --- Warm start ---
+
+
+def load_pidm(path, env):
+    """Weights and normalizer of a PIDM checkpoint; UserError if it was made for another robot, layout of x or K."""
+    pidm, meta = records.load(path, "PIDM checkpoint")
+    for name, ours in (("robot", env.robot.name), ("layout", list(env.prop_layout)), ("history", env.config.history)):
+        if meta[name] != ours:
+            raise records.UserError(f"{path} was made for {name} {meta[name]}, this task has {name} {ours}")
+    return pidm
+
+
+def shuffle(tree, key):
+    """A control beyond the paper: permute the numbers within each weight matrix. Keeps scales, destroys knowledge."""
+    leaves, structure = jax.tree.flatten(tree)
+    keys = jax.random.split(key, len(leaves))
+    mixed = [jax.random.permutation(k, leaf.ravel()).reshape(leaf.shape) for k, leaf in zip(keys, leaves, strict=True)]
+    return structure.unflatten(mixed)
+
+
+def warm_start(args, params, pidm):
+    """Copy the PIDM's history_encoder and backbone into actor and critic, or into the one that args.init names."""
+    params = jax.tree.map(lambda x: x, params)  # new dicts, so that the caller's stay as they are
+    weights = {name: pidm["params"][name] for name in CORE}
+    if args.init == "shuffled":
+        weights = shuffle(weights, jax.random.fold_in(jax.random.key(args.seed), 1))
+    for branch in (args.init,) if args.init in ("actor", "critic") else ("actor", "critic"):
+        records.check_shapes(args.pretrained, weights, {name: params["params"][branch][name] for name in CORE})
+        params["params"][branch] |= jax.tree.map(jnp.asarray, weights)
+    return params
+
+
+def zero_inputs(env, net):
+    """Inputs of the right shapes."""
+    steps = env.config.history
+    history = {"prop": jnp.zeros((steps + 1, env.prop_dim)), "action": jnp.zeros((steps, env.action_dim))}
+    return net_inputs(net, jnp.zeros(env.obs_dim), history)
+
+
+def init_params(args, env, net, key):
+    """Fresh networks; a PIDM gets its robot's normalizer, and the pretrained weights where they are asked for."""
+    params = net.init(key, zero_inputs(env, net))
+    if args.network == "mlp":
+        return params
+    # every arm has the same input scaling, so that they differ in nothing but the weights
+    pidm = load_pidm(Path(args.pretrained or SHIPPED / f"{env.robot.name}.msgpack"), env)
+    params = params | {"normalizer": {name: jnp.asarray(pidm["normalizer"][name]) for name in params["normalizer"]}}
+    return warm_start(args, params, pidm) if args.pretrained else params
+
+
+def describe(args, params):
+    """One line a submodule of actor and critic: its layers, and whether it was loaded."""
+    loads = {"actor": ("actor",), "critic": ("critic",)}.get(args.init, ("actor", "critic"))
+    for branch in ("actor", "critic"):
+        for name, part in params["params"][branch].items():
+            shapes = [layer["kernel"].shape for layer in part.values()]
+            loaded = args.pretrained and branch in loads and name in CORE
+            widths = "-".join(str(width) for width in (shapes[0][0], *(shape[1] for shape in shapes)))
+            print(f"  {branch:6} {name:18} {'loaded' if loaded else 'fresh ':6}  {widths}")
 
 
 # --- Rollout ---
@@ -142,9 +334,10 @@ class TrainState:
     iteration: jax.Array  # () PPO iterations done
 
 
+# >>> copy: rollout (owner: ppo_finetune.py)
 @flax.struct.dataclass
 class Rollout:
-    obs: jax.Array  # (T, N, O)
+    inputs: dict  # what the network reads, name -> (T, N, ...)
     action: jax.Array  # (T, N, A)
     mean: jax.Array  # (T, N, A) of the policy that acted
     log_prob: jax.Array  # (T, N)
@@ -160,28 +353,6 @@ def log_prob(mean, log_std, action):
     return -0.5 * jnp.sum(z**2 + 2 * log_std + jnp.log(2 * jnp.pi), -1)
 
 
-def rollout(args, env, net, params, env_state, key):
-    """Act for T steps in N environments. Returns the last environment state, a Rollout and metrics (T,)."""
-
-    def step(env_state, key):
-        obs = env_state.obs
-        mean, log_std, value = net.apply(params, obs)
-        action = mean + jnp.exp(log_std) * jax.random.normal(key, mean.shape)
-        env_state = jax.vmap(env.step)(env_state, action)
-        # Deviation: rsl_rl bootstraps time-outs with V of the observation before the step, which is not the last one.
-        final_value = net.apply(params, env_state.final_obs, method=net.value)
-        bootstrap = args.gamma * final_value * (env_state.truncated if env.bootstrap_time_outs else 0.0)
-        done = env_state.terminated | env_state.truncated
-        logp = log_prob(mean, log_std, action)
-        return env_state, (
-            Rollout(obs, action, mean, logp, value, env_state.reward, bootstrap, done),
-            step_metrics(env_state, done),
-        )
-
-    env_state, (roll, metrics) = jax.lax.scan(step, env_state, jax.random.split(key, args.num_steps))
-    return env_state, roll, metrics
-
-
 def step_metrics(env_state, done):
     """Means over environments, and sums over the episodes that ended in this step."""
     metrics = dict(env_state.metrics)
@@ -190,9 +361,36 @@ def step_metrics(env_state, done):
     return {name: value.mean() for name, value in metrics.items()} | {"reward": env_state.reward.mean()} | ended
 
 
+# <<< copy: rollout
+
+
+def rollout(args, env, net, params, env_state, key):
+    """Act for T steps in N environments. Returns the last environment state, a Rollout and metrics (T,)."""
+
+    def step(env_state, key):
+        inputs = net_inputs(net, env_state.obs, env_state.history)
+        mean, log_std, value = net.apply(params, inputs)
+        action = mean + jnp.exp(log_std) * jax.random.normal(key, mean.shape)
+        env_state = jax.vmap(env.step)(env_state, action)
+        # Deviation: rsl_rl bootstraps time-outs with V of the observation before the step, which is not the last one.
+        final_inputs = net_inputs(net, env_state.final_obs, env_state.final_history)
+        final_value = net.apply(params, final_inputs, method=net.value)
+        bootstrap = args.gamma * final_value * (env_state.truncated if env.bootstrap_time_outs else 0.0)
+        done = env_state.terminated | env_state.truncated
+        logp = log_prob(mean, log_std, action)
+        return env_state, (
+            Rollout(inputs, action, mean, logp, value, env_state.reward, bootstrap, done),
+            step_metrics(env_state, done),
+        )
+
+    env_state, (roll, metrics) = jax.lax.scan(step, env_state, jax.random.split(key, args.num_steps))
+    return env_state, roll, metrics
+
+
 # --- Objective ---
 
 
+# >>> copy: objective (owner: ppo_finetune.py)
 def gae(args, reward, done, value, last_value):
     """Generalised advantage estimation, Schulman et al. 2016 eq. 16. (T, N) in, advantage and return (T, N) out."""
 
@@ -216,7 +414,7 @@ def gaussian_kl(mean_old, log_std_old, mean, log_std):
 
 def ppo_loss(args, net, params, log_std_old, roll, advantage, ret):
     """Clipped surrogate, clipped value loss and entropy bonus of one minibatch (leading axis B)."""
-    mean, log_std, value = net.apply(params, roll.obs)
+    mean, log_std, value = net.apply(params, roll.inputs)
     ratio = jnp.exp(log_prob(mean, log_std, roll.action) - roll.log_prob)
     clipped = jnp.clip(ratio, 1 - args.clip, 1 + args.clip)
     policy_loss = -jnp.minimum(ratio * advantage, clipped * advantage).mean()
@@ -237,33 +435,36 @@ def ppo_loss(args, net, params, log_std_old, roll, advantage, ret):
     )
 
 
-def mirror_loss(env, net, params, obs, mean, key):
-    """Squared difference of mean(mirrored obs) and the mirrored mean(obs), for one mirror drawn of the robot's.
+def mirror_loss(env, net, params, inputs, mean, key):
+    """Squared difference of mean(mirrored inputs) and the mirrored mean(inputs), for one mirror drawn of the robot's.
 
-    The target carries no gradient (Mittal et al. 2024). obs (B, O), mean (B, A). A quarter of the minibatch, which is
-    shuffled already, gives the same expectation for a quarter of the work.
+    The target carries no gradient (Mittal et al. 2024). mean (B, A). A quarter of the minibatch, which is shuffled
+    already, gives the same expectation for a quarter of the work.
     """
-    obs, mean = obs[: -(-len(obs) // 4)], mean[: -(-len(mean) // 4)]
-    tables = [(*tables["obs"], *tables["action"]) for tables in env.mirrors.values()]
-    stacked = [jnp.stack(column) for column in zip(*tables, strict=True)]
-    which = jax.random.randint(key, (), 0, len(tables))
-    obs_perm, obs_sign, act_perm, act_sign = (column[which] for column in stacked)
-    mirrored = net.apply(params, obs[:, obs_perm] * obs_sign, method=net.mean)
-    return jnp.mean((mirrored - jax.lax.stop_gradient(mean)[:, act_perm] * act_sign) ** 2)
+    inputs, mean = jax.tree.map(lambda x: x[: -(-len(x) // 4)], (inputs, mean))
+    which = jax.random.randint(key, (), 0, len(env.mirrors))
+    table = jax.tree.map(lambda *tables: jnp.stack(tables)[which], *env.mirrors.values())
+    mirrored = {name: x[..., table[name][0]] * table[name][1] for name, x in inputs.items()}
+    target = jax.lax.stop_gradient(mean)[:, table["action"][0]] * table["action"][1]
+    return jnp.mean((net.apply(params, mirrored, method=net.mean) - target) ** 2)
 
 
 def loss_with_mirror(args, env, net, params, log_std_old, batch, key):
     """What a minibatch step descends: PPO's loss, plus the mirror loss where the robot has a symmetry."""
     loss, mean, metrics = ppo_loss(args, net, params, log_std_old, *batch)
     if args.mirror_coef and env.mirrors:
-        metrics["mirror_loss"] = mirror_loss(env, net, params, batch[0].obs, mean, key)
+        metrics["mirror_loss"] = mirror_loss(env, net, params, batch[0].inputs, mean, key)
         loss += args.mirror_coef * metrics["mirror_loss"]
     return loss, metrics
+
+
+# <<< copy: objective
 
 
 # --- Update ---
 
 
+# >>> copy: update (owner: ppo_finetune.py)
 def adapt_lr(args, lr, kl):
     """rsl_rl's rule: step size down by 1.5 where a minibatch's KL is over twice the target, up where below half."""
     lr = jnp.where(kl > 2 * args.desired_kl, jnp.maximum(lr / 1.5, 1e-5), lr)
@@ -277,7 +478,7 @@ def clip_gradients(args, grads):
     norms = [optax.tree.norm(part) for part in (actor, critic)]
     scales = [jnp.minimum(1.0, args.max_grad_norm / (norm + 1e-6)) for norm in norms]
     parts = [jax.tree.map(lambda g: g * scale, part) for part, scale in zip((actor, critic), scales, strict=True)]
-    return {"params": parts[0] | parts[1]}, jnp.stack(norms)
+    return grads | {"params": parts[0] | parts[1]}, jnp.stack(norms)
 
 
 def update(args, env, net, opt, state, roll, advantage, ret, key):
@@ -309,14 +510,29 @@ def update(args, env, net, opt, state, roll, advantage, ret, key):
     return *carry, jax.tree.map(jnp.mean, metrics)
 
 
+# <<< copy: update
+
+
+def update_magnitude(before, after):
+    """Mean absolute change of each submodule's weights, averaged over its layers (paper Sec. IV-E, Fig. 6)."""
+    changes = {}
+    for branch in ("actor", "critic"):
+        for name, part in before["params"][branch].items():
+            new = after["params"][branch][name]
+            layers = [jnp.abs(new[layer]["kernel"] - part[layer]["kernel"]).mean() for layer in part]
+            changes[f"update/{branch}/{name}"] = jnp.stack(layers).mean()
+    return changes
+
+
 def iteration(args, env, net, opt, state):
     """One PPO iteration: rollout, advantages, update. Its randomness depends on (seed, iteration) alone."""
     k_roll, k_update = jax.random.split(jax.random.fold_in(jax.random.key(args.seed), state.iteration))
     env_state, roll, metrics = rollout(args, env, net, state.params, state.env, k_roll)
-    last_value = net.apply(state.params, env_state.obs, method=net.value)
+    last_value = net.apply(state.params, net_inputs(net, env_state.obs, env_state.history), method=net.value)
     advantage, ret = gae(args, roll.reward + roll.bootstrap, roll.done, roll.value, last_value)
     params, opt_state, lr, losses = update(args, env, net, opt, state, roll, advantage, ret, k_update)
     metrics = {k: v.sum() if k.startswith("sum/") else v.mean() for k, v in metrics.items()} | losses
+    metrics |= update_magnitude(state.params, params) if args.network == "pidm" else {}
     metrics |= {
         "explained_variance": 1 - jnp.var(ret - roll.value) / (jnp.var(ret) + 1e-8),
         "lr": lr,
@@ -328,7 +544,7 @@ def iteration(args, env, net, opt, state):
 def init_state(args, env, net, opt):
     """Fresh networks, and N environments whose episode clocks start anywhere, so that time-outs spread out."""
     k_net, k_env, k_clock = jax.random.split(jax.random.key(args.seed), 3)
-    params = net.init(k_net, jnp.zeros(env.obs_dim))
+    params = init_params(args, env, net, k_net)
     clocks = jax.random.randint(k_clock, (args.num_envs,), 0, env.episode_steps)
     env_state = jax.jit(jax.vmap(env.reset))(jax.random.split(k_env, args.num_envs), clocks)
     return TrainState(params, opt.init(params), jnp.float32(args.lr), env_state, jnp.zeros((), jnp.int32))
@@ -342,7 +558,7 @@ def evaluate(env, net, params, num_envs):
 
     def step(carry, _):
         env_state, alive = carry
-        action = net.apply(params, env_state.obs, method=net.mean)
+        action = net.apply(params, net_inputs(net, env_state.obs, env_state.history), method=net.mean)
         env_state = jax.vmap(env.step)(env_state, action)
         done = env_state.terminated | env_state.truncated
         out = (env_state.metrics, env_state.reward), alive, env_state.terminated & alive, env_state.physics.qpos[0]
@@ -366,14 +582,15 @@ def run_eval(args):
     from envs import render  # matplotlib and OpenGL are slow to load and not needed for training
 
     path = Path(args.eval)
-    params, meta = records.load(path)
+    params, meta = records.load(path, "policy")
     if meta["task"] != args.task:
         raise records.UserError(
             f"{path} is a policy for {meta['task']}, not for {args.task}; pass --task {meta['task']}"
         )
     env, show = make_env(args), make_env(args, **envs.TASKS[args.task][0].SHOWCASE)
-    net = ActorCritic(tuple(meta["args"]["hidden"]), env.action_dim, meta["args"]["init_std"])
-    like = jax.eval_shape(net.init, jax.random.key(0), jnp.zeros(env.obs_dim))
+    trained = {name: meta["args"][name] for name in ("network", "init_std")}
+    net = make_net(dataclasses.replace(args, **trained, hidden=tuple(meta["args"]["hidden"])), env)
+    like = jax.eval_shape(net.init, jax.random.key(0), zero_inputs(env, net))
     records.check_shapes(path, params, like)
     result, _ = jax.jit(lambda p: evaluate(env, net, p, args.eval_envs))(params)
     showcase, qpos = jax.jit(lambda p: evaluate(show, net, p, min(args.eval_envs, 16)))(params)
@@ -397,15 +614,15 @@ def make_env(args, **overrides):
         raise records.UserError(str(error)) from None
 
 
-def make_row(args, iterations, seconds, metrics):
-    """One CSV row from a chunk's metrics (log_every,): means, and means over the episodes that ended."""
-    metrics = {name: value.sum() if name.startswith("sum/") else value.mean() for name, value in metrics.items()}
-    episodes = metrics.pop("sum/episodes")
-    ended = {"fall_rate": "falls", "episode_return": "episode_return", "episode_seconds": "episode_seconds"}
-    ended = {name: metrics.pop(f"sum/{key}") / episodes if episodes else float("nan") for name, key in ended.items()}
-    steps = args.num_envs * args.num_steps
-    row = {"iteration": iterations, "env_steps": iterations * steps, "seconds": seconds, **ended, **metrics}
-    return {name: float(f"{float(value):.6g}") for name, value in row.items()}
+SHOWN = ("episode_return", "fall_rate", "lin_vel_error", "kl", "action_std")  # in the printed line
+
+
+def plot(rows, path):
+    """Return, fall rate, task metrics, action std and reward terms over environment steps."""
+    errors = [name for name in rows[0] if name.endswith("_error")]
+    terms = [name for name in rows[0] if name.startswith("reward/")]
+    names = ("episode_return", "fall_rate", *errors, "action_std")
+    records.plot_curves(rows, names, {"reward terms per step": terms}, path)
 
 
 # --- Main ---
@@ -418,9 +635,11 @@ def train(args):
     out = records.start_run(args, env.config, args.run_dir, args.force)
     print(f"{args.task}: observation {env.obs_dim}, action {env.action_dim}, engine {type(env.engine).__name__}")
     print("  ".join(f"{name}={value}" for name, value in dataclasses.asdict(args).items()), flush=True)
-    net = ActorCritic(args.hidden, env.action_dim, args.init_std)
+    net = make_net(args, env)
     opt = optax.scale_by_adam()
     state = init_state(args, env, net, opt)
+    if args.network == "pidm":
+        describe(args, state.params)
 
     @jax.jit
     def train_chunk(state):
@@ -431,21 +650,23 @@ def train(args):
     chunk = train_chunk.lower(state).compile()
     print(f"compiled in {time.perf_counter() - start:.1f} s", flush=True)
     start = last = time.perf_counter()
-    with records.Reporter(iterations) as reporter:
+    rows = []
+    with records.Reporter(iterations, SHOWN) as reporter:
         while int(state.iteration) < iterations and not reporter.stopped:
             state, metrics = chunk(state)
             metrics = jax.device_get(metrics)
             now = time.perf_counter()
-            row = make_row(args, int(state.iteration), now - start, metrics)
-            records.log_row(out / "metrics.csv", row)
+            row = records.make_row(args, int(state.iteration), now - start, metrics)
+            rows.append(row)
+            records.save_rows(out / "metrics.csv", rows)
             reporter.show(row, args.log_every * args.num_envs * args.num_steps / (now - last))
             last = now
             if not all(jnp.isfinite(x).all() for x in jax.tree.leaves(state.params)):
                 raise records.UserError(f"weights are not finite after iteration {row['iteration']}; lower --lr")
-            records.save(out / "policy.msgpack", state.params, args)
+            records.save(out / "policy.msgpack", state.params, {"task": args.task, "args": dataclasses.asdict(args)})
     if reporter.stopped:
         print("interrupted")
-    records.plot_curve(out / "metrics.csv", out / "curve.png")
+    plot(rows, out / "curve.png")
     print(f"wrote {out}/policy.msgpack, metrics.csv, curve.png")
     return state
 

@@ -1,7 +1,8 @@
-"""Robot tasks. `envs.make("go1_loco")` is all a script needs; `envs.TASKS` lists the names."""
+"""Robot tasks. `envs.make("go1_loco")` is all a script needs; `envs.TASKS` lists the names, `envs.EXPLORE` robots."""
 
 from envs import locomotion
 from envs.base import replace_checked
+from envs.explore import EXPLORE, Explore
 
 TASKS = {
     "anymal_loco": (locomotion.AnymalLocomotion, locomotion.ANYMAL_LOCO),
@@ -19,3 +20,10 @@ def make(task, engine="auto", **overrides):
         raise ValueError(f"unknown task {task!r}; choose one of {', '.join(TASKS)}")
     family, config = TASKS[task]
     return family(replace_checked(config, overrides), engine)
+
+
+def make_explore(robot, engine="auto", **overrides):
+    """Build a robot's exploration environment (stage 1). ValueError as for `make`."""
+    if robot not in EXPLORE:
+        raise ValueError(f"unknown robot {robot!r}; choose one of {', '.join(EXPLORE)}")
+    return Explore(replace_checked(EXPLORE[robot], overrides), engine)

@@ -32,6 +32,9 @@ class Config:
     noise: float = 1.0  # multiplies the sensor noise of NOISE
     reward_floor: float = -0.5  # per second, on the sum of all terms but termination
     termination_reward: float = 0.0  # once, when an episode ends by failure
+    # end of an episode
+    contact_ends: tuple[str, ...] = ("base",)  # sensors <name>_force whose contact is a failure
+    max_tilt: float = 180.0  # [deg] a steeper trunk is a failure
     # start of an episode
     spawn_xy: float = 0.5  # [m] half-width around the origin
     spawn_yaw: float = np.pi  # [rad] half-width around forward
@@ -40,6 +43,7 @@ class Config:
     # randomisation, drawn once an episode
     friction: tuple[float, float] = (0.7, 0.7)
     added_mass: tuple[float, float] = (0.0, 0.0)  # [kg] on the base
+    link_mass: tuple[float, float] = (1.0, 1.0)  # factor on each link's mass and inertia
     push_velocity: float = 0.0  # [m/s] half-width of a sudden change of horizontal velocity
     push_seconds: tuple[float, float] = (10.0, 15.0)  # time between pushes
 
@@ -88,6 +92,23 @@ class Motion:
     foot_vel: jax.Array  # (F, 3) world
     foot_contact: jax.Array  # (F,) bool, more than 1 N
     sensors: jax.Array  # (S,) all readings, for the contact forces of other bodies
+
+
+@flax.struct.dataclass
+class FootClocks:
+    """How long each foot has been in the air or on the ground; a task family's state builds on it."""
+
+    air_time: jax.Array  # (F,) [s] since the foot left the ground
+    contact_time: jax.Array  # (F,) [s] since it landed
+    landed_after: jax.Array  # (F,) [s] flight that ended in this step, else 0
+
+    def tick(self, contact, dt):
+        """One control step later; contact (F,) bool."""
+        return self.replace(
+            landed_after=jnp.where(contact, self.air_time, 0.0),
+            air_time=jnp.where(contact, 0.0, self.air_time + dt),
+            contact_time=jnp.where(contact, self.contact_time + dt, 0.0),
+        )
 
 
 def rotate(quat, vec):
@@ -157,8 +178,10 @@ class Env:
             kind: self.engine.sensor(*(f"{foot}_{kind}" for foot in self.robot.feet))
             for kind in ("pos", "vel", "force")
         }
+        self.ends = self.engine.sensor(*(f"{name}_force" for name in config.contact_ends))
         self.legs = self.leg_chains()
         self.mirrors = {mirror: self.mirror_tables(mirror) for mirror in self.robot.mirrors}
+        self.prop_layout = tuple(PROP)  # blocks of x_t
         self.prop_dim = sum(self.width(kind) for kind in PROP.values())
         self.obs_dim = sum(self.width(kind) for kind, _ in self.OBS.values())
 
@@ -172,17 +195,28 @@ class Env:
         """The task's own state at the start of an episode."""
         raise NotImplementedError
 
+    def ground_height(self, xy):
+        """Height of the ground [m] at horizontal positions (..., 2)."""
+        return jnp.zeros(xy.shape[:-1])
+
+    def place(self, key):
+        """Where an episode starts: x, y (2,) [m] and yaw () [rad]."""
+        k_xy, k_yaw = jax.random.split(key)
+        c = self.config
+        return uniform(k_xy, -c.spawn_xy, c.spawn_xy, (2,)), uniform(k_yaw, -c.spawn_yaw, c.spawn_yaw)
+
     def track(self, task, motion):
-        """Bring the task state up to this step's motion, before rewards (contact clocks)."""
-        return task
+        """Bring the task state up to this step's motion, before rewards."""
+        return task.tick(motion.foot_contact, self.dt)
 
     def rewards(self, task, motion, action, last_action):
         """Reward terms by name, unweighted, per second; those without a weight are ignored."""
         raise NotImplementedError
 
     def failed(self, task, motion):
-        """Whether the episode ends in failure."""
-        raise NotImplementedError
+        """Whether the episode ends in failure: a body on the ground that should not be, or a fall."""
+        force = jnp.linalg.norm(motion.sensors[self.ends], axis=-1)
+        return jnp.any(force > 1.0) | (-motion.gravity[2] < jnp.cos(jnp.deg2rad(self.config.max_tilt)))
 
     def advance(self, key, task, motion, clock):
         """Task state for the next step (commands), after rewards."""
@@ -285,19 +319,20 @@ class Env:
     def spawn(self, key):
         """Physics at the start of an episode: default pose, random place and heading, feet on the ground."""
         c, m = self.config, self.model
-        k_xy, k_yaw, k_joint, k_vel, k_friction, k_mass = jax.random.split(key, 6)
+        k_place, k_link, k_joint, k_vel, k_friction, k_mass = jax.random.split(key, 6)
         joints = self.default_pose * uniform(k_joint, *c.spawn_joints, (self.action_dim,))
         low, high = m.jnt_range[1:].T
         joints = jnp.clip(joints, low, high)
-        height = self.robot.sole - jnp.min(self.feet_in_base(joints)[:, 2])
-        quat = axis_angle(jnp.array([0.0, 0, 1]), uniform(k_yaw, -c.spawn_yaw, c.spawn_yaw))
-        xy = uniform(k_xy, -c.spawn_xy, c.spawn_xy, (2,))
+        xy, yaw = self.place(k_place)
+        quat = axis_angle(jnp.array([0.0, 0, 1]), yaw)
+        feet = rotate(quat, self.feet_in_base(joints))
+        height = jnp.max(self.ground_height(xy + feet[:, :2]) + self.robot.sole - feet[:, 2])
         qpos = jnp.concatenate([xy, height[None], quat, joints])
         base_vel = uniform(k_vel, -c.spawn_velocity, c.spawn_velocity, (6,))
         qvel = jnp.concatenate([base_vel, jnp.zeros(self.action_dim)])
         base = 1  # the first body after the world
         added = uniform(k_mass, *c.added_mass)
-        mass_scale = jnp.ones(m.nbody).at[base].add(added / m.body_mass[base])
+        mass_scale = uniform(k_link, *c.link_mass, (m.nbody,)).at[base].add(added / m.body_mass[base])
         return self.engine.initial(qpos, qvel, uniform(k_friction, *c.friction), mass_scale)
 
     def push_interval(self, key):
@@ -305,7 +340,7 @@ class Env:
         return jnp.round(uniform(key, *self.config.push_seconds) / self.dt).astype(jnp.int32)
 
     def push(self, key, physics, clock, push_at):
-        """Change the horizontal base velocity at once, when it is time."""
+        """Disturb the robot: change the horizontal base velocity at once, when it is time."""
         k_vel, k_next = jax.random.split(key)
         now = clock >= push_at
         kick = uniform(k_vel, -self.config.push_velocity, self.config.push_velocity, (2,)) * now

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from envs import rewards
-from envs.base import Config, Env, axis_angle, inverse, joint_indices, rotate, soft_limits, uniform, wrap
+from envs.base import Config, Env, FootClocks, axis_angle, inverse, joint_indices, rotate, soft_limits, uniform, wrap
 
 
 @dataclass(frozen=True)
@@ -25,20 +25,15 @@ class LocomotionConfig(Config):
     fixed_velocity: tuple[float, float] | None = None  # [m/s] vx, vy along the world's x for all; for evaluation
     air_time_threshold: float = 0.5  # [s]
     effort_joints: tuple[str, ...] = ("",)  # name parts of the joints whose torque and acceleration are punished
-    contact_ends: tuple[str, ...] = ("base",)  # sensors <name>_force whose contact is a failure
-    max_tilt: float = 180.0  # [deg] a steeper trunk is a failure
 
 
 @flax.struct.dataclass
-class Task:
+class Task(FootClocks):
     """State of velocity tracking."""
 
     command: jax.Array  # (3,) forward [m/s], sideways [m/s], turning [rad/s], base frame
     heading: jax.Array  # () wanted yaw [rad]
     moves: jax.Array  # () bool: not one of the standing commands
-    air_time: jax.Array  # (F,) [s] since the foot left the ground
-    contact_time: jax.Array  # (F,) [s] since it landed
-    landed_after: jax.Array  # (F,) [s] flight that ended in this step, else 0
 
 
 class Locomotion(Env):
@@ -57,14 +52,13 @@ class Locomotion(Env):
 
     def __init__(self, config, engine="auto"):
         super().__init__(config, engine)
-        self.ends = self.engine.sensor(*(f"{name}_force" for name in config.contact_ends))
         self.effort = joint_indices(self.robot, *config.effort_joints)
         self.command_steps = round(config.command_seconds / self.dt)
 
     def init_task(self, key, physics):
         feet = jnp.zeros(len(self.robot.feet))
         command, heading, moves = self.draw_command(key)
-        task = Task(command, heading, moves, air_time=feet, contact_time=feet, landed_after=feet)
+        task = Task(feet, feet, feet, command=command, heading=heading, moves=moves)
         return self.steer(task, self.motion(physics).yaw)
 
     def draw_command(self, key):
@@ -81,14 +75,6 @@ class Locomotion(Env):
         turn = jnp.clip(0.5 * wrap(task.heading - yaw), -self.config.yaw_rate, self.config.yaw_rate)
         return task.replace(command=jnp.where(task.moves, task.command.at[2].set(turn), 0.0))
 
-    def track(self, task, motion):
-        contact = motion.foot_contact
-        return task.replace(
-            landed_after=jnp.where(contact, task.air_time, 0.0),
-            air_time=jnp.where(contact, 0.0, task.air_time + self.dt),
-            contact_time=jnp.where(contact, task.contact_time + self.dt, 0.0),
-        )
-
     def advance(self, key, task, motion, clock):
         command, heading, moves = self.draw_command(key)
         fresh = task.replace(command=command, heading=heading, moves=moves)
@@ -98,10 +84,6 @@ class Locomotion(Env):
 
     def task_inputs(self, task, sensed):
         return {"command": task.command}
-
-    def failed(self, task, motion):
-        force = jnp.linalg.norm(motion.sensors[self.ends], axis=-1)
-        return jnp.any(force > 1.0) | (-motion.gravity[2] < jnp.cos(jnp.deg2rad(self.config.max_tilt)))
 
     def rewards(self, task, motion, action, last_action):
         m, c = motion, self.config

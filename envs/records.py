@@ -5,6 +5,7 @@ Every file is replaced in one step, so that a stopped run leaves none half-writt
 
 import csv
 import dataclasses
+import io
 import json
 import os
 import platform
@@ -48,6 +49,23 @@ def replace_text(path, text):
     tmp.replace(path)
 
 
+def check_positive(args, names):
+    """UserError unless these arguments are at least 1."""
+    for name in names:
+        if getattr(args, name) < 1:
+            raise UserError(f"--{name.replace('_', '-')} must be at least 1, not {getattr(args, name)}")
+
+
+def check_minibatches(args):
+    """UserError unless the minibatches divide a rollout."""
+    size = args.num_envs * args.num_steps
+    if size % args.num_minibatches:
+        raise UserError(
+            f"{args.num_minibatches} minibatches do not divide a rollout of {args.num_envs} environments x "
+            f"{args.num_steps} steps = {size}; change --num-minibatches or --num-envs"
+        )
+
+
 def start_run(args, config, folder, force):
     """Create the run folder with args.json in it and return it. Refuses to overwrite a run unless `force`.
 
@@ -66,28 +84,34 @@ def start_run(args, config, folder, force):
     return out
 
 
-def save(path, params, args):
-    """Write weights, task and arguments as one msgpack file, in one step."""
-    meta = {"task": args.task, "args": dataclasses.asdict(args), "versions": versions()}
+def save(path, params, meta):
+    """Write weights and a JSON-able dict that says what they are, as one msgpack file, in one step."""
     blob = flax.serialization.msgpack_serialize(
-        {"params": flax.serialization.to_state_dict(jax.device_get(params)), "meta": json.dumps(meta)}
+        {
+            "params": flax.serialization.to_state_dict(jax.device_get(params)),
+            "meta": json.dumps(meta | {"versions": versions()}),
+        }
     )
     tmp = path.with_name(path.name + ".tmp")
     tmp.write_bytes(blob)
     tmp.replace(path)
 
 
-def load(path):
-    """Read what `save` wrote: params and meta. UserError if the file is missing or is not one of ours."""
+KINDS = {"policy": {"task", "args"}, "PIDM checkpoint": {"robot", "layout", "history"}}  # and what their meta holds
+
+
+def load(path, kind):
+    """Read what `save` wrote: params and meta. UserError if the file is missing or is not one of that kind."""
     try:
         content = flax.serialization.msgpack_restore(path.read_bytes())
-        meta = json.loads(content["meta"])
-        assert {"task", "args"} <= meta.keys()
-        return content["params"], meta
+        params, meta = content["params"], json.loads(content["meta"])
     except OSError as error:
-        raise UserError(f"cannot read policy {path}: {error.strerror}") from None
-    except Exception:  # msgpack has no common error class; whatever it says, the file is not a policy
-        raise UserError(f"{path} is not a policy file, or it is damaged") from None
+        raise UserError(f"cannot read {kind} {path}: {error.strerror}") from None
+    except Exception:  # msgpack has no common error class; whatever it says, the file is not ours
+        raise UserError(f"{path} is not a {kind}, or it is damaged") from None
+    if not KINDS[kind] <= meta.keys():
+        raise UserError(f"{path} is not a {kind}; it holds {', '.join(sorted(meta))}")
+    return params, meta
 
 
 def check_shapes(path, params, like):
@@ -103,50 +127,62 @@ def line(row):
     return "  ".join(f"{name} {float(value):.4g}" for name, value in row.items())
 
 
-def log_row(path, row):
-    """Append one row to a CSV file."""
-    new = not path.exists()
-    with path.open("a", newline="") as file:
-        writer = csv.DictWriter(file, row)
-        if new:
-            writer.writeheader()
-        writer.writerow(row)
+def save_rows(path, rows):
+    """Write rows, dicts of the same names, as a whole CSV file in one step."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, rows[0], lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    replace_text(path, text.getvalue())
 
 
-def plot_curve(csv_path, out_path):
-    """Draw return, fall rate, task metrics and reward terms over environment steps."""
+def make_row(args, iterations, seconds, metrics):
+    """One CSV row from a chunk's metrics (log_every,): means, and means over the episodes that ended."""
+    metrics = {name: value.sum() if name.startswith("sum/") else value.mean() for name, value in metrics.items()}
+    episodes = metrics.pop("sum/episodes")
+    ended = {"fall_rate": "falls", "episode_return": "episode_return", "episode_seconds": "episode_seconds"}
+    ended = {name: metrics.pop(f"sum/{key}") / max(episodes, 1) for name, key in ended.items()}
+    if not episodes:  # say so, instead of 0
+        ended = dict.fromkeys(ended, float("nan"))
+    steps = args.num_envs * args.num_steps
+    row = {"iteration": iterations, "env_steps": iterations * steps, "seconds": seconds, **ended, **metrics}
+    return {name: float(f"{float(value):.6g}") for name, value in row.items()}
+
+
+def pyplot():
+    """matplotlib.pyplot without a display; it is slow to load, so only where something is drawn."""
     import matplotlib
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    with csv_path.open() as file:
-        rows = list(csv.DictReader(file))
-    columns = {name: [float(row[name]) for row in rows] for name in rows[0]}
-    names = ["episode_return", "fall_rate", *(name for name in columns if name.endswith("_error")), "action_std"]
-    terms = [name for name in columns if name.startswith("reward/")]
-    fig, axes = plt.subplots(1, len(names) + 1, figsize=(3.2 * (len(names) + 1), 2.8), constrained_layout=True)
-    for ax, name in zip(axes, names, strict=False):
-        ax.plot(columns["env_steps"], columns[name])
-        ax.set_title(name)
-    for name in terms:
-        axes[-1].plot(columns["env_steps"], columns[name], label=name.removeprefix("reward/"), lw=1)
-    axes[-1].set_title("reward terms per step")
-    axes[-1].legend(fontsize=5)
-    for ax in axes:
-        ax.set_xlabel("environment steps")
+    return plt
+
+
+def plot_curves(rows, names, groups, path, over="env_steps"):
+    """Draw each named column over column `over`, then each group (title -> names) in one panel."""
+    plt = pyplot()
+    panels = {name: [name] for name in names} | groups
+    steps = [row[over] for row in rows]
+    fig, axes = plt.subplots(1, len(panels), figsize=(3.2 * len(panels), 2.8), constrained_layout=True)
+    for ax, (title, columns) in zip(axes, panels.items(), strict=True):
+        for name in columns:
+            ax.plot(steps, [row[name] for row in rows], label=name.split("/")[-1], lw=1)
+        if len(columns) > 1:
+            ax.legend(fontsize=5)
+        ax.set_title(title)
+        ax.set_xlabel(over.replace("_", " "))
         ax.grid(alpha=0.3)
-    fig.savefig(out_path, dpi=110, metadata={"Software": None})
+    fig.savefig(path, dpi=110, metadata={"Software": None})
     plt.close(fig)
 
 
 class Reporter:
     """Progress: a live bar on a terminal, one plain line a row elsewhere. Ctrl-C sets `stopped`, to end after a row."""
 
-    SHOWN = ("episode_return", "fall_rate", "lin_vel_error", "kl", "action_std")
-
-    def __init__(self, total):
-        self.total, self.bar, self.stopped = total, None, False
+    def __init__(self, total, names):
+        """total: iterations of the run; names: the columns to show."""
+        self.total, self.names, self.bar, self.stopped = total, names, None, False
 
     def stop(self, *_):
         self.stopped = True  # an exception could strike inside the physics callback
@@ -168,8 +204,9 @@ class Reporter:
             self.bar.stop()
 
     def show(self, row, speed):
-        shown = {name: row[name] for name in self.SHOWN if name in row}
-        text = f"{row['env_steps'] / 1e6:.2f}M steps  {speed:,.0f}/s  {line(shown)}"
+        shown = {name: row[name] for name in self.names if name in row}
+        count = row["env_steps"] if "env_steps" in row else row["samples"]
+        text = f"{count / 1e6:.2f}M {'steps' if 'env_steps' in row else 'samples'}  {speed:,.0f}/s  {line(shown)}"
         if self.bar:
             self.bar.update(self.task, completed=row["iteration"], description=text)
         else:

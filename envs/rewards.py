@@ -26,6 +26,11 @@ def air_time(landed_after, threshold, command):
     return jnp.sum(jnp.where(landed_after > 0, landed_after - threshold, 0.0)) * moving(command)
 
 
+def hasty_steps(landed_after, threshold):
+    """How much shorter than a threshold [s] a flight was, when the foot lands; landed_after (F,) [s]."""
+    return jnp.sum(jnp.where(landed_after > 0, jnp.maximum(threshold - landed_after, 0.0), 0.0))
+
+
 def single_stance(air_time, contact_time, command):
     """Biped gait: how long this leg swings and the other stands, at most 0.4 s; 0 in flight or on both feet."""
     contact = contact_time > 0

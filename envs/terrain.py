@@ -1,10 +1,11 @@
-"""The ground a robot stands on, added to its MJCF. Flat for now.
+"""The ground a robot stands on, added to its MJCF: a plane, and beside it a field of Perlin noise.
 
 Contact masks: ground contype 0, conaffinity 1; robot contype 1, conaffinity 0. Without them MJX collides floor
 and obstacles with each other and throws bodies into the air.
 """
 
 import mujoco
+import numpy as np
 
 
 def flat_scene(robot, visual=False):
@@ -19,6 +20,55 @@ def flat_scene(robot, visual=False):
     else:
         for geom in [geom for geom in spec.geoms if geom.group == 2]:
             spec.delete(geom)  # their poses would be computed in every physics step
+    return spec
+
+
+ROUGH_CENTRE, ROUGH_HALF, CELL = 15.0, 8.0, 0.1  # [m] the field lies at (ROUGH_CENTRE, 0); its half-width; its grid
+
+
+def perlin(cells, period, rng):
+    """Gradient noise of one octave, about within 0.7 (Perlin 1985): (cells + 1, cells + 1), a lattice point every
+    `period` cells."""
+    lattice = rng.uniform(0, 2 * np.pi, (cells // period + 2, cells // period + 2))
+    position = np.arange(cells + 1) / period
+    corner, inside = position.astype(int), position % 1
+    fade = inside**3 * (inside * (6 * inside - 15) + 10)
+    noise = np.zeros((cells + 1, cells + 1))
+    for dy in (0, 1):
+        for dx in (0, 1):
+            angle = lattice[np.ix_(corner + dy, corner + dx)]
+            slope = np.sin(angle) * (inside - dy)[:, None] + np.cos(angle) * (inside - dx)[None]
+            noise += slope * np.outer(fade if dy else 1 - fade, fade if dx else 1 - fade)
+    return noise
+
+
+def perlin_heights(amplitude):
+    """Heights [m] of the rough field (rows along y, columns along x): 0 to 2 amplitude, 0 at the border."""
+    rng, cells = np.random.default_rng(0), round(2 * ROUGH_HALF / CELL)
+    noise = perlin(cells, 10, rng) + 0.5 * perlin(cells, 5, rng)
+    ramp = np.clip(np.minimum(np.arange(cells + 1), np.arange(cells + 1)[::-1]) / 10, 0, 1)  # over 1 m
+    return amplitude * np.clip(1 + noise, 0, 2) * np.minimum.outer(ramp, ramp)
+
+
+def rough_scene(robot, heights, visual=False):
+    """The flat scene with a field of `heights` (see perlin_heights) beside it."""
+    spec = flat_scene(robot, visual)
+    top = heights.max()
+    spec.add_hfield(
+        name="rough",
+        nrow=heights.shape[0],
+        ncol=heights.shape[1],
+        size=[ROUGH_HALF, ROUGH_HALF, top, 0.5],
+        userdata=(heights / top).ravel(),
+    )
+    spec.worldbody.add_geom(
+        name="rough",
+        type=mujoco.mjtGeom.mjGEOM_HFIELD,
+        hfieldname="rough",
+        pos=[ROUGH_CENTRE, 0, 0],
+        contype=0,
+        conaffinity=1,
+    )
     return spec
 
 

@@ -9,7 +9,15 @@ import pytest
 ROOT = Path(__file__).resolve().parent.parent
 SCRIPTS = [path.name for path in ROOT.glob("*.py")]
 ENVS = [f"envs/{path.name}" for path in (ROOT / "envs").glob("*.py")]
-LAYERS = ["robots", "terrain", "engine", "base", "rewards", "locomotion"]  # each may import what stands before it
+LAYERS = [
+    "robots",
+    "terrain",
+    "engine",
+    "base",
+    "rewards",
+    "locomotion",
+    "explore",
+]  # each may import what stands before it
 FUNCS = (ast.FunctionDef, ast.AsyncFunctionDef)
 
 
