@@ -143,6 +143,7 @@ class G1Locomotion(Locomotion):
             "track_lin_vel": rewards.track_lin_vel(task.command[:2], lin_vel[:2]),
             "track_yaw_rate": rewards.track_yaw_rate(task.command[2], ang_vel[2]),
             "flight": rewards.flight(m.foot_contact, task.command),
+            "one_foot": rewards.one_foot(m.foot_contact, task.command),
             "single_stance": rewards.single_stance(task.air_time, task.contact_time, task.command),
             "ankle_limits": rewards.beyond(ankles, low[self.ankles], high[self.ankles]),
             "hip_deviation": jnp.sum(jnp.abs(m.joint_pos[self.hips])),
@@ -218,6 +219,7 @@ G1_LOCO = LocomotionConfig(
         "track_yaw_rate": 1.0,
         # Deviation: with Isaac Lab's 0.75 and no flight term it hops on both feet; its single torso joint cannot bow.
         "single_stance": 2.0,
+        "one_foot": 0.5,
         "flight": -1.0,
         "slip": -0.1,
         "ankle_limits": -1.0,

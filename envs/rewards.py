@@ -38,6 +38,11 @@ def single_stance(air_time, contact_time, command):
     return jnp.where(jnp.sum(contact) == 1, jnp.minimum(jnp.min(phase), 0.4), 0.0) * moving(command)
 
 
+def one_foot(contact, command):
+    """1 while exactly one foot is on the ground and the command moves: pays a biped from its first short step on."""
+    return (jnp.sum(contact) == 1) * moving(command)
+
+
 def flight(contact, command):
     """1 while no foot is on the ground although the command moves: a hop, where a walk is wanted; contact (F,)."""
     return jnp.all(~contact) * moving(command)

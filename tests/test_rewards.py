@@ -67,6 +67,7 @@ def reference(env, physics, task, action, last_action):
         terms["track_lin_vel"] = np.exp(-np.sum((np.array(task.command[:2]) - heading_vel) ** 2) / 0.25)
         terms["track_yaw_rate"] = np.exp(-((task.command[2] - (base @ ang_vel)[2]) ** 2) / 0.25)
         phase = [c if on else a for a, c, on in zip(task.air_time, task.contact_time, contact, strict=True)]
+        terms["one_foot"] = moving * (sum(contact) == 1)
         terms["flight"] = moving * (sum(contact) == 0)
         terms["single_stance"] = moving * (sum(contact) == 1) * min(*phase, 0.4)
         limit = 0.0
