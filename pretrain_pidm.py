@@ -53,7 +53,7 @@ class Args:
 
 PRESETS = {
     "smoke": {"epochs": 2, "batch": 64},
-    "cpu": {"epochs": 10, "batch": 1024},
+    "cpu": {"epochs": 20, "batch": 1024},
     "gpu": {"epochs": 100, "batch": 8192},
 }
 
@@ -430,6 +430,10 @@ def pretrain(args):
     args, env = merge(args, robot), envs.make_explore(robot, "c")
     if dataset.meta["layout"] != list(env.prop_layout):
         raise records.UserError(f"{args.data} has x = {dataset.meta['layout']}, not {list(env.prop_layout)}")
+    for name, width in (("x", env.prop_dim), ("action", env.action_dim)):
+        if getattr(dataset, name).shape[-1] != width:
+            found = getattr(dataset, name).shape[-1]
+            raise records.UserError(f"{args.data}/{name}.npy holds {found} numbers a step, {robot} has {width}")
     count = len(dataset.train) if args.num_samples is None else args.num_samples
     if not 1 <= count <= len(dataset.train):
         raise records.UserError(f"--num-samples {count} is not within 1 and the {len(dataset.train)} in {args.data}")

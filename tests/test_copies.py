@@ -13,7 +13,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
 SCRIPTS = ("ppo_explore.py", "pretrain_pidm.py", "ppo_finetune.py")
-OWN = {"Args", "Rollout", "TrainState", "evaluate", "init_state", "iteration", "main", "rollout"}
+OWN = {"Args", "TrainState", "evaluate", "init_state", "iteration", "main", "make_env", "merge", "plot", "predict"}
 BLOCK = re.compile(r"^# >>> copy: (\w+) \(owner: (\w+\.py)\)\n(.*?)^# <<< copy: \1$", re.M | re.S)
 
 

@@ -1,0 +1,141 @@
+"""Make the shipped PIDM of a robot: collect, pretrain, look at the data, keep the small files.
+
+    python results/pidm.py --robots go1 anymal_d g1
+    python results/pidm.py --robots go1 --stages look
+
+Weights go to assets/pidm/<robot>.msgpack, everything else to results/pidm/<robot>.
+"""
+
+import json
+import shutil
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import jax
+import numpy as np
+import tyro
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(ROOT))
+
+import ppo_finetune
+import pretrain_pidm
+from envs import records
+
+EARLY = 100  # iterations of a task's training whose states the coverage figure shows (paper Fig. 4a)
+
+
+@dataclass(frozen=True)
+class Args:
+    robots: tuple[str, ...] = ("go1", "anymal_d", "g1")
+    preset: Literal["smoke", "cpu", "gpu"] = "cpu"
+    stages: tuple[Literal["collect", "pretrain", "look"], ...] = ("collect", "pretrain", "look")
+
+
+def run(*words):
+    """One of the scripts, in a process of its own."""
+    subprocess.run([sys.executable, *words], cwd=ROOT, check=True)
+
+
+def keep(robot):
+    """Copy the small files of both stages, and the weights."""
+    kept, explored, trained = (
+        ROOT / path for path in (f"results/pidm/{robot}", f"runs/explore/{robot}/seed0", f"runs/pidm/{robot}/seed0")
+    )
+    (kept / "explore").mkdir(parents=True, exist_ok=True)
+    for name in ("meta.json", "metrics.csv", "curve.png"):
+        shutil.copy(explored / name, kept / "explore" / name)
+    for name in ("args.json", "metrics.csv", "validation.json", "curve.png", "accuracy.png", "distribution.png"):
+        shutil.copy(trained / name, kept / name)
+    (ROOT / "assets/pidm").mkdir(exist_ok=True)
+    shutil.copy(trained / "pidm.msgpack", ROOT / f"assets/pidm/{robot}.msgpack")
+
+
+def sample(folder, count=20_000):
+    """x_t of evenly spread transitions of a collection, (count, X)."""
+    dataset = pretrain_pidm.Dataset(folder)
+    flat = dataset.x.reshape(-1, dataset.x.shape[-1])
+    return np.asarray(flat[np.linspace(0, len(flat) - 1, count).astype(int)])
+
+
+def early_states(task, count=20_000):
+    """x_t from the first iterations of a task's training with an MLP, (count, X), without sensor noise."""
+    env = ppo_finetune.envs.make(task, noise=0.0)
+    args = ppo_finetune.merge(ppo_finetune.Args(task=task), env.config.ppo)
+    net, opt = ppo_finetune.make_net(args, env), ppo_finetune.optax.scale_by_adam()
+    step = jax.jit(lambda s: ppo_finetune.iteration(args, env, net, opt, s)[0])
+    state, seen = ppo_finetune.init_state(args, env, net, opt), []
+    for _ in range(EARLY):
+        state = step(state)
+        seen.append(np.asarray(state.env.history["prop"][:, -1]))
+    seen = np.concatenate(seen)
+    return seen[np.linspace(0, len(seen) - 1, count).astype(int)]
+
+
+def occupied(env, x, bins=20):
+    """Share of a grid over each pair of joints of a limb that x (S, X) visits, mean over pairs."""
+    low, high = env.model.jnt_range[1:].T
+    q = x[:, 6 : 6 + env.action_dim] + np.asarray(env.default_pose)
+    cells = np.clip(((q - low) / (high - low) * bins).astype(int), 0, bins - 1)
+    pairs = [(i, i + 1) for i in range(env.action_dim - 1) if env.robot.joints[i][:2] == env.robot.joints[i + 1][:2]]
+    return float(np.mean([len(np.unique(cells[:, i] * bins + cells[:, j])) / bins**2 for i, j in pairs]))
+
+
+def project(sets):
+    """Two-dimensional picture of sets of x_t: UMAP, or PCA where umap-learn is not installed. Name and points."""
+    everything = np.concatenate(sets)
+    scaled = (everything - everything.mean(0)) / everything.std(0)
+    try:
+        import umap
+
+        name, flat = "UMAP", umap.UMAP(random_state=0).fit_transform(scaled)
+    except ImportError:
+        name, flat = "PCA (umap-learn is not installed)", scaled @ np.linalg.svd(scaled, full_matrices=False)[2][:2].T
+    return name, np.split(flat, np.cumsum([len(x) for x in sets])[:-1])
+
+
+def look(args, robot):
+    """Coverage: joint space against random actions, and a projection against the early states of the robot's task."""
+    task = robot.removesuffix("_d") + "_loco"
+    random = f"runs/explore/{robot}/random"
+    if not (ROOT / random / "meta.json").exists():
+        words = ("--robot", robot, "--preset", args.preset, "--policy", "random", "--run-dir", random, "--force")
+        run("ppo_explore.py", *words, "--total-steps", "300000")
+    env = ppo_finetune.envs.make_explore(robot, "c")
+    kinds = {
+        "exploration": sample(ROOT / f"runs/explore/{robot}/seed0"),
+        "random actions": sample(ROOT / random),
+        f"first {EARLY} iterations of {task}": early_states(task),
+    }
+    coverage = {name: occupied(env, x) for name, x in kinds.items()}
+    print(robot, records.line(coverage))
+    kept = ROOT / f"results/pidm/{robot}"
+    records.replace_text(kept / "coverage.json", json.dumps(coverage, indent=1) + "\n")
+    name, points = project([x[::5] for x in kinds.values()])
+    plt = records.pyplot()
+    fig, ax = plt.subplots(figsize=(5, 4), constrained_layout=True)
+    for label, xy in zip(kinds, points, strict=True):
+        ax.scatter(*xy.T, s=1, alpha=0.4, label=label)
+    ax.set(title=f"{name} of x_t, {robot}", xticks=[], yticks=[])
+    ax.legend(markerscale=8, fontsize=8)
+    fig.savefig(kept / "coverage.png", dpi=110, metadata={"Software": None})
+    plt.close(fig)
+
+
+def main(args):
+    for robot in args.robots:
+        if "collect" in args.stages:
+            run("ppo_explore.py", "--robot", robot, "--preset", args.preset, "--force")
+        if "pretrain" in args.stages:
+            data = f"runs/explore/{robot}/seed0"
+            run("pretrain_pidm.py", "--data", data, "--preset", args.preset, "--force")
+            keep(robot)
+        if "look" in args.stages:
+            look(args, robot)
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Args, description=__doc__))

@@ -1,0 +1,287 @@
+"""Stage 1: exploration environments, the ensemble, and what a collection leaves on disk."""
+
+import dataclasses
+import errno
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import optax
+import pytest
+
+import envs
+import ppo_explore as script
+import ppo_finetune
+import pretrain_pidm
+from envs import records
+
+ROOT = Path(__file__).resolve().parent.parent
+SMOKE = script.Args(preset="smoke", total_steps=400)
+
+
+@pytest.fixture(scope="module")
+def go1():
+    return envs.make_explore("go1", "c")
+
+
+# --- environments ---
+
+
+def test_rough_ground_is_what_a_ray_meets(go1):
+    data = mujoco.MjData(go1.model)
+    mujoco.mj_forward(go1.model, data)
+    xy = np.random.default_rng(0).uniform([5, -10], [25, 10], (500, 2))
+    want = np.asarray(go1.ground_height(jnp.asarray(xy)))
+    for point, height in zip(xy, want, strict=True):
+        start = np.array([*point, 5.0])
+        distance = mujoco.mj_ray(go1.model, data, start, np.array([0.0, 0, -1]), None, 1, -1, np.zeros(1, np.int32))
+        assert abs(5.0 - distance - height) < 0.002
+    assert want.max() > 0.05 and want.min() == 0.0
+
+
+@pytest.mark.parametrize("robot", envs.EXPLORE)
+def test_robots_start_on_the_ground(robot):
+    """Some episodes start on the plane and some on rough ground; feet are on it, not in it, and masses differ."""
+    env = envs.make_explore(robot, "c")
+    physics = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), 200)).physics
+    rough = np.asarray(env.on_rough(physics))
+    assert 60 < rough.sum() < 140
+    data = mujoco.MjData(env.model)
+    for qpos in np.asarray(physics.qpos, np.float64):
+        data.qpos[:] = qpos
+        mujoco.mj_forward(env.model, data)
+        feet = np.array([data.site(foot).xpos for foot in env.robot.feet])
+        gaps = feet[:, 2] - env.robot.sole - np.asarray(env.ground_height(jnp.asarray(feet[:, :2])))
+        assert -1e-3 < gaps.min() < 1e-3, gaps
+    scales = np.asarray(physics.mass_scale)[:, 2:]
+    assert 0.85 <= scales.min() < 0.9 and 1.1 < scales.max() <= 1.15
+    assert np.ptp(np.asarray(physics.friction)) > 0.7
+
+
+def test_forces_come_and_go(go1):
+    """The perturbing force stays until it changes, reaches the simulation, and is zero about half the time."""
+    step, seen = jax.jit(jax.vmap(go1.step)), []
+    state = jax.jit(jax.vmap(go1.reset))(jax.random.split(jax.random.key(0), 64))
+    for _ in range(150):
+        state = step(state, jnp.zeros((64, 12)))
+        seen.append(np.asarray(state.physics.wrench[:, 1, :3]))
+    pushed = np.any(np.stack(seen), -1)
+    assert np.abs(seen).max() <= 25.0 and 0.1 < pushed[-20:].mean() < 0.8
+    changes = (np.diff(np.stack(seen), axis=0) != 0).any(-1).mean()
+    assert changes < 0.05
+
+
+def test_engines_agree_on_rough_ground():
+    """A robot that stands on the height field for 10 control steps: both engines hold it up at the same place.
+
+    Only that: MJX finds other contact points on the field's edges than C does, and moving robots part from there.
+    """
+    states = {}
+    for engine in ("c", "mjx"):
+        env = envs.make_explore("go1", engine, rough=1.0, perturb_force=0.0, push_velocity=0.0, max_tilt=180.0)
+        state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(3), 4))
+        step = jax.jit(jax.vmap(env.step))
+        for _ in range(10):
+            state = step(state, jnp.zeros((4, 12)))
+        states[engine] = np.asarray(state.physics.qpos[:, :3])
+    np.testing.assert_allclose(states["c"], states["mjx"], atol=0.02)
+
+
+# --- ensemble ---
+
+
+def toy(key, count, spread=1.0):
+    """Transitions of a linear system of Go1's sizes: delta = B a."""
+    k_a, k_p = jax.random.split(key)
+    action = spread * jax.random.normal(k_a, (count, 12))
+    matrix = jax.random.normal(jax.random.key(9), (12, 30))
+    prop = jax.random.normal(k_p, (count, 6, 30))
+    return script.Transitions(prop, jnp.zeros((count, 5, 12)), action @ matrix, action)
+
+
+@pytest.fixture(scope="module")
+def fitted():
+    """An ensemble retrained 40 times on the toy system, its error before and after, and its parts."""
+    args = dataclasses.replace(SMOKE, members=3, ensemble_batch=128)
+    member, opt = script.PIDM(script.MEMBER, 24), optax.adam(1e-3)
+    buffer = toy(jax.random.key(0), 2048)
+    norm = script.statistics(buffer)
+    one = jax.tree.map(lambda x: x[0], buffer)
+    keys = jax.random.split(jax.random.key(1), 3)
+    params = jax.vmap(lambda k: member.init(k, script.flat_history(norm, one.prop, one.past), one.delta)["params"])(
+        keys
+    )
+    ensemble = script.Ensemble(params, opt.init(params), norm, jnp.zeros(()))
+    retrain = jax.jit(lambda e, k: script.retrain(args, member, opt, e, buffer, 2048, k))
+    losses = []
+    for i in range(40):
+        ensemble, loss = retrain(ensemble, jax.random.key(i))
+        losses.append(float(loss))
+    return member, params, ensemble, losses, buffer
+
+
+def test_ensemble_learns_and_disagreement_shrinks(fitted):
+    """Its members agree on what they were trained on, and less on actions three times as large."""
+    member, params, ensemble, losses, buffer = fitted
+    assert losses[-1] < losses[0] - 0.5
+
+    def doubt(weights, batch):
+        return float(script.disagreement(script.predict(member, weights, ensemble.norm, batch)[0]).mean())
+
+    known, novel = doubt(ensemble.params, buffer), doubt(ensemble.params, toy(jax.random.key(5), 512, spread=3.0))
+    assert known < 0.5 * doubt(params, buffer) and novel > 2 * known
+
+
+def test_equal_members_do_not_disagree(fitted):
+    member, params, ensemble, _, buffer = fitted
+    same = jax.tree.map(lambda x: jnp.repeat(x[:1], 3, 0), params)
+    mean, _ = script.predict(member, same, ensemble.norm, buffer)
+    np.testing.assert_allclose(script.disagreement(mean), 0.0, atol=1e-10)
+
+
+def test_disagreement_is_the_variance_over_members():
+    mean = np.random.default_rng(0).normal(size=(5, 7, 3))
+    want = [np.mean([np.var(mean[:, b, a]) for a in range(3)]) for b in range(7)]
+    np.testing.assert_allclose(script.disagreement(jnp.asarray(mean)), want, rtol=1e-5)
+
+
+def test_bootstrap_draws_differ_per_member_and_stay_within_the_data():
+    draws = np.asarray(script.bootstrap(jax.random.key(0), (8, 5, 512), 1000))
+    assert draws.max() < 1000 and len(np.unique(draws[0, 0])) < 512  # with replacement
+    for member in range(1, 5):
+        assert (draws[:, member] == draws[:, 0]).mean() < 0.01
+
+
+def test_nll_by_hand():
+    """A member that predicts mean 0 and variance 1: half the mean square of the action."""
+    member = script.PIDM(script.MEMBER, 24)
+    buffer = toy(jax.random.key(0), 16)
+    norm = script.statistics(buffer)
+    one = jax.tree.map(lambda x: x[0], buffer)
+    params = member.init(jax.random.key(0), script.flat_history(norm, one.prop, one.past), one.delta)["params"]
+    zero = jax.tree.map(lambda x: jnp.zeros_like(x)[None], params)
+    got = script.nll(member, zero, norm, jax.tree.map(lambda x: x[None], buffer))
+    np.testing.assert_allclose(got, 0.5 * np.mean(np.asarray(buffer.action) ** 2), rtol=1e-5)
+
+
+# --- a collection ---
+
+
+@pytest.fixture(scope="module")
+def collected(tmp_path_factory):
+    out = tmp_path_factory.mktemp("collections") / "a"
+    return out, script.main(dataclasses.replace(SMOKE, run_dir=str(out)))
+
+
+def test_collection_on_disk(collected):
+    """Stored x_t and a_t are the windows that the last rollout's ensemble data show; meta.json counts them."""
+    out, state = collected
+    meta = json.loads((out / "meta.json").read_text())
+    assert meta["robot"] == "go1" and meta["transitions"] == 800 and meta["validation_envs"] == [3]
+    arrays = {name: np.load(out / f"{name}.npy") for name in ("x", "action", "first", "rough", "lin_vel")}
+    assert arrays["x"].shape == (25, 8, 4, 30) and arrays["lin_vel"].shape == (25, 8, 4, 3)
+    assert arrays["first"][0, 0].all() and np.isfinite(arrays["x"]).all()
+    np.testing.assert_allclose(np.linalg.norm(arrays["x"][..., 3:6], axis=-1), 1.0, atol=1e-5)  # gravity, no noise
+    assert not list(out.glob("*.tmp"))
+    # the ring buffer holds the last 8 rollouts with the environment's own histories
+    dataset = pretrain_pidm.Dataset(out)
+    flat = {name: np.asarray(x) for name, x in dataclasses.asdict(state.buffer).items()}
+    index = np.arange(24 * 32, 25 * 32 - 4)  # last rollout but for its last step
+    usable = np.isin(index, np.concatenate([dataset.train, dataset.validation]))
+    slot = np.arange(32 - 4)  # iteration 24 wrote slot 0 of the ring
+    got = dataset.windows(index[usable])
+    np.testing.assert_array_equal(got["prop"], flat["prop"][slot[usable]])
+    np.testing.assert_array_equal(got["past"], flat["past"][slot[usable]])
+    np.testing.assert_allclose(got["next_x"] - got["prop"][:, -1], flat["delta"][slot[usable]], atol=1e-6)
+
+
+def test_same_seed_same_data(collected, tmp_path):
+    script.main(dataclasses.replace(SMOKE, run_dir=str(tmp_path / "b")))
+    for name in ("x", "action", "first"):
+        assert (tmp_path / "b" / f"{name}.npy").read_bytes() == (collected[0] / f"{name}.npy").read_bytes()
+
+
+def test_random_policy_does_not_learn(tmp_path):
+    state = script.main(dataclasses.replace(SMOKE, policy="random", run_dir=str(tmp_path / "r")))
+    assert float(jnp.exp(state.params["params"]["log_std"]).mean()) == pytest.approx(1.0)
+
+
+def test_stages_one_to_three_through_files(collected, tmp_path):
+    """Explore, pretrain, finetune and evaluate as a user would, each reading what the one before wrote."""
+    pidm, run = tmp_path / "pidm", tmp_path / "run"
+    pretrain_pidm.main(pretrain_pidm.Args(data=str(collected[0]), preset="smoke", run_dir=str(pidm)))
+    args = ppo_finetune.Args(preset="smoke", pretrained=str(pidm / "pidm.msgpack"), run_dir=str(run))
+    ppo_finetune.main(args)
+    _, meta = records.load(run / "policy.msgpack", "policy")
+    assert meta["args"]["network"] == "pidm"
+    header = (run / "metrics.csv").read_text().splitlines()[0].split(",")
+    assert {"update/actor/backbone", "update/actor/intention_encoder", "update/critic/value_synthesizer"} <= set(header)
+    ppo_finetune.main(ppo_finetune.Args(eval=str(run / "policy.msgpack"), eval_envs=2))
+    assert (run / "eval.json").exists()
+
+
+# --- faults ---
+
+
+def refused(capsys, args, *words):
+    with pytest.raises(SystemExit) as stop:
+        script.main(args)
+    err = capsys.readouterr().err
+    assert stop.value.code == 2 and err.count("\n") == 1 and err.startswith("error: "), err
+    for word in words:
+        assert word in err, err
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"robot": "spot"}, ["unknown robot 'spot'", "go1"]),
+        ({"num_envs": 1}, ["--validation 0.08 of 1 environments"]),
+        ({"validation": 0.0}, ["--validation 0.0"]),
+        ({"members": 0}, ["--members must be at least 1"]),
+        ({"num_minibatches": 5}, ["5 minibatches do not divide"]),
+    ],
+)
+def test_bad_arguments_are_refused(changes, words, tmp_path, capsys):
+    refused(capsys, dataclasses.replace(SMOKE, run_dir=str(tmp_path / "run"), **changes), *words)
+    assert not (tmp_path / "run").exists()
+
+
+def test_data_are_not_overwritten(collected, capsys):
+    before = (collected[0] / "x.npy").read_bytes()
+    refused(capsys, dataclasses.replace(SMOKE, run_dir=str(collected[0])), "--force")
+    assert (collected[0] / "x.npy").read_bytes() == before
+
+
+def test_full_disk_is_one_line_and_leaves_no_arrays(tmp_path, capsys, monkeypatch):
+    def full(*_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "posix_fallocate", full)
+    refused(capsys, dataclasses.replace(SMOKE, run_dir=str(tmp_path / "run")), "cannot reserve", "No space left")
+    assert not list((tmp_path / "run").glob("*.npy"))
+
+
+def test_interrupted_collection_is_unfinished(tmp_path, capsys):
+    """Ctrl-C after the first row: exit without a traceback, no meta.json, and stage 2 says why it refuses."""
+    command = [sys.executable, "ppo_explore.py", "--preset", "smoke", "--total-steps", "1000000"]
+    command += ["--run-dir", str(tmp_path)]
+    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        deadline = time.monotonic() + 120
+        while not (tmp_path / "metrics.csv").exists() and time.monotonic() < deadline:
+            time.sleep(0.2)
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=60)
+    assert process.returncode == 0 and "unfinished collection" in out and "Traceback" not in err, err
+    assert not (tmp_path / "meta.json").exists()
+    with pytest.raises(SystemExit):
+        pretrain_pidm.main(pretrain_pidm.Args(data=str(tmp_path), preset="smoke"))
+    assert "unfinished collection" in capsys.readouterr().err

@@ -1,0 +1,341 @@
+"""Stage 2 and warm start: windows against a slow reference, mirrors and noise, what is loaded, what is refused."""
+
+import dataclasses
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import envs
+import ppo_finetune as finetune
+import pretrain_pidm as script
+from envs import records
+
+K, X, A = 5, 30, 12  # Go1
+LAYOUT = ["ang_vel", "gravity", "joint_pos", "joint_vel"]
+
+
+def write_dataset(folder, first, x, action, **changes):
+    """A finished collection of given arrays (iterations, T, N, ...)."""
+    folder.mkdir(parents=True, exist_ok=True)
+    arrays = {"x": x, "action": action, "first": first, "rough": np.zeros_like(first)}
+    for name, array in arrays.items():
+        np.save(folder / f"{name}.npy", array)
+    iterations, steps, count = first.shape
+    meta = {
+        "robot": "go1",
+        "layout": LAYOUT,
+        "iterations": iterations,
+        "num_steps": steps,
+        "num_envs": count,
+        "history": K,
+        "validation_envs": [count - 1],
+        "transitions": first.size,
+        "args": {},
+        "versions": {},
+    }
+    (folder / "meta.json").write_text(json.dumps(meta | changes))
+    return folder
+
+
+def random_dataset(folder, seed=0, iterations=6, steps=7, count=5, **changes):
+    """Random numbers whose episodes have every length from 1 step on."""
+    rng = np.random.default_rng(seed)
+    first = rng.random((iterations, steps, count)) < 0.25
+    first[0, 0] = True
+    x = rng.normal(size=(*first.shape, X)).astype(np.float32)
+    action = rng.normal(size=(*first.shape, A)).astype(np.float32)
+    return write_dataset(folder, first, x, action, **changes)
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    return script.Dataset(random_dataset(tmp_path_factory.mktemp("data")))
+
+
+@pytest.fixture(scope="module")
+def go1():
+    return envs.make_explore("go1", "c")
+
+
+def replay(first, x, action):
+    """Histories as an environment keeps them, step by step in plain Python: flat index -> prop, past."""
+    steps, count = first.shape
+    windows = {}
+    for n in range(count):
+        for t in range(steps):
+            if first[t, n]:
+                prop, past = [x[t, n]] * (K + 1), [np.zeros(A)] * K
+            else:
+                prop, past = [*prop[1:], x[t, n]], [*past[1:], action[t - 1, n]]
+            windows[t * count + n] = np.array(prop), np.array(past)
+    return windows
+
+
+def test_windows_match_a_slow_replay(dataset):
+    """Every usable transition, over resets of every distance, has the history its environment had."""
+    first = np.load(dataset.x.base.filename.replace("x.npy", "first.npy")).reshape(-1, 5)
+    want = replay(first, np.asarray(dataset.x), np.asarray(dataset.action))
+    index = np.sort(np.concatenate([dataset.train, dataset.validation]))
+    steps, count = first.shape
+    usable = [t * count + n for t in range(steps - 1) for n in range(count) if not first[t + 1, n]]
+    np.testing.assert_array_equal(index, usable)  # and only these: no window looks across a reset
+    got = dataset.windows(index)
+    for row, i in enumerate(index):
+        np.testing.assert_array_equal(got["prop"][row], want[i][0])
+        np.testing.assert_array_equal(got["past"][row], want[i][1])
+        np.testing.assert_array_equal(got["next_x"][row], dataset.x[i // count + 1, i % count])
+        np.testing.assert_array_equal(got["action"][row], dataset.action[i // count, i % count])
+
+
+def test_validation_environments_are_held_out(dataset):
+    assert set(dataset.validation % 5) == {4} and 4 not in set(dataset.train % 5)
+
+
+def test_padding_is_the_environments(tmp_path, jitted):
+    """Windows of a recorded rollout equal the histories that the environment itself kept, episode starts included."""
+    task = jitted("go1_loco", noise=0.0, episode_seconds=0.16)
+    state, rows = task.start(3), []
+    first = np.ones(3, bool)
+    for i in range(24):
+        before, state = state, task.act(state, i)
+        rows.append((first, before.history["prop"], before.history["action"], state.action))
+        rows[-1] = (*rows[-1][:3], 0.5 * jax.random.normal(jax.random.key(i), (3, A)))
+        first = np.asarray(state.terminated | state.truncated)
+    first, prop, past, action = (np.stack(column) for column in zip(*rows, strict=True))
+    assert first.sum() > 6  # some episodes ended
+    folder = write_dataset(tmp_path / "d", first[None], prop[None, :, :, -1], action[None])
+    data = script.Dataset(folder)
+    index = np.sort(np.concatenate([data.train, data.validation]))
+    got = data.windows(index)
+    np.testing.assert_allclose(got["prop"], prop.reshape(-1, K + 1, X)[index], atol=1e-6)
+    np.testing.assert_allclose(got["past"], past.reshape(-1, K, A)[index], atol=1e-6)
+
+
+def test_noise_repeats_in_padding(dataset, go1):
+    """Each state is read once: rows that pad a window show the same noisy first x; bounds are the tasks'."""
+    batch = dataset.windows(dataset.train)
+    width = script.noise_width(go1)
+    noisy = script.add_noise(jax.random.key(0), width, batch)
+    moved = np.asarray(noisy["prop"]) - batch["prop"]
+    assert (np.abs(moved) <= np.asarray(width) + 1e-6).all() and np.abs(moved).max() > 1.4
+    padded = np.flatnonzero(batch["pad"] >= 2)
+    assert len(padded)
+    for i in padded:
+        np.testing.assert_array_equal(noisy["prop"][i, 0], noisy["prop"][i, batch["pad"][i]])
+
+
+@pytest.mark.parametrize("robot", ["anymal_d", "g1"])
+def test_mirrored_window_is_window_of_the_mirrored_trajectory(robot, tmp_path):
+    env = envs.make_explore(robot, "c")
+    rng = np.random.default_rng(0)
+    first = rng.random((2, 9, 3)) < 0.2
+    first[0, 0] = True
+    x, action = (rng.normal(size=(*first.shape, n)).astype(np.float32) for n in (env.prop_dim, env.action_dim))
+    plain = script.Dataset(write_dataset(tmp_path / "plain", first, x, action, robot=robot))
+    for name, tables in env.mirrors.items():
+        images = (array[..., tables[kind][0]] * tables[kind][1] for kind, array in (("prop", x), ("action", action)))
+        other = script.Dataset(write_dataset(tmp_path / name, first, *images, robot=robot))
+        want = other.windows(other.train)
+        got = script.mirror_windows(tables, plain.windows(plain.train))
+        for part in want:
+            np.testing.assert_array_equal(got[part], want[part], err_msg=f"{name} {part}")
+
+
+def test_normalizer_commutes_with_mirrors(dataset, go1):
+    """A mirrored robot has mirrored statistics, or the network would see two input distributions."""
+    norm = script.make_normalizer(script.Args(), go1, jax.random.key(0), dataset.windows(dataset.train))
+    for tables in go1.mirrors.values():
+        for name, kind in (("prop", "prop"), ("delta", "prop"), ("action", "action")):
+            perm, sign = tables[kind]
+            np.testing.assert_allclose(norm[f"{name}_mean"][perm] * sign, norm[f"{name}_mean"], atol=1e-5)
+            np.testing.assert_allclose(norm[f"{name}_std"][perm], norm[f"{name}_std"], rtol=1e-5)
+
+
+def linear_dataset(folder):
+    """x_{t+1} = x_t + B a_t with a fixed matrix B: a network that inverts it names the action."""
+    rng = np.random.default_rng(0)
+    first = np.zeros((20, 10, 16), bool)
+    first[0, 0] = True
+    action = rng.normal(size=(*first.shape, A)).astype(np.float32)
+    moves = action @ rng.normal(size=(A, X)).astype(np.float32)
+    x = np.cumsum(moves.reshape(200, 16, X), 0).reshape(moves.shape) - moves
+    return write_dataset(folder, first, x, action)
+
+
+@pytest.fixture(scope="module")
+def pretrained(tmp_path_factory):
+    """A tiny pretraining on the linear system: its folder."""
+    folder = tmp_path_factory.mktemp("linear")
+    out = folder / "out"
+    data = linear_dataset(folder / "data")
+    script.main(script.Args(data=str(data), preset="smoke", noise=0.0, mirror=False, epochs=8, run_dir=str(out)))
+    return out
+
+
+def test_error_falls_on_a_linear_system(pretrained):
+    result = json.loads((pretrained / "validation.json").read_text())
+    assert result["error"] < 0.5 * result["mean_action_error"]
+    np.testing.assert_allclose(result["mean_action_error"], (2 / np.pi) ** 0.5, rtol=0.1)  # E|a| of a unit Gaussian
+    assert result["error_rad"] == pytest.approx(0.25 * result["error"])
+    for name in ("curve.png", "accuracy.png", "distribution.png"):
+        assert (pretrained / name).stat().st_size > 5000
+
+
+def test_same_seed_same_weights(pretrained, tmp_path):
+    data = linear_dataset(tmp_path / "data")
+    for name in ("a", "b"):
+        script.main(script.Args(data=str(data), preset="smoke", num_samples=500, run_dir=str(tmp_path / name)))
+    one, two = (records.load(tmp_path / name / "pidm.msgpack", "PIDM checkpoint")[0] for name in "ab")
+    jax.tree.map(np.testing.assert_array_equal, one, two)
+
+
+# --- warm start ---
+
+
+def fresh_and_warm(path, init):
+    """Parameters of a random and of a warm-started PIDM actor-critic of the same seed, and the checkpoint."""
+    env = envs.make("go1_loco", "c")
+    args = finetune.merge(
+        finetune.Args(preset="smoke", network="pidm", pretrained=str(path), init=init), env.config.ppo
+    )
+    net = finetune.make_net(args, env)
+    warm = finetune.init_params(args, env, net, jax.random.key(0))
+    return net.init(jax.random.key(0), finetune.zero_inputs(env, net)), warm, finetune.load_pidm(path, env)
+
+
+@pytest.mark.parametrize("init", ["both", "actor", "critic"])
+def test_warm_start_copies_the_named_parts_and_no_others(pretrained, init):
+    fresh, warm, pidm = fresh_and_warm(pretrained / "pidm.msgpack", init)
+    for branch in ("actor", "critic"):
+        for name, part in warm["params"][branch].items():
+            loaded = name in ("history_encoder", "backbone") and init in ("both", branch)
+            want = pidm["params"][name] if loaded else fresh["params"][branch][name]
+            jax.tree.map(np.testing.assert_array_equal, part, want)
+    for name in ("prop_mean", "prop_std", "action_mean", "action_std"):
+        np.testing.assert_array_equal(warm["normalizer"][name], pidm["normalizer"][name])
+
+
+def test_shuffled_weights_keep_their_values_and_lose_their_place(pretrained):
+    _, warm, pidm = fresh_and_warm(pretrained / "pidm.msgpack", "shuffled")
+    for branch in ("actor", "critic"):
+        got, want = (p["backbone"]["Dense_1"]["kernel"] for p in (warm["params"][branch], pidm["params"]))
+        np.testing.assert_array_equal(np.sort(np.ravel(got)), np.sort(np.ravel(want)))
+        assert (np.asarray(got) == want).mean() < 0.01
+
+
+def test_first_actions_are_small_wherever_the_first_rollout_gets(pretrained, jitted):
+    """A warm-started actor still commands (nearly) the default pose: |mean| < 0.02 (paper Sec. III-E)."""
+    task = jitted("go1_loco")
+    env, state = task.env, task.start(64)
+    args = finetune.merge(finetune.Args(preset="smoke", pretrained=str(pretrained / "pidm.msgpack")), env.config.ppo)
+    net = finetune.make_net(args, env)
+    params = finetune.init_params(args, env, net, jax.random.key(0))
+    largest = []
+    for i in range(24):
+        inputs = finetune.net_inputs(net, state.obs, state.history)
+        largest.append(float(jnp.abs(net.apply(params, inputs, method=net.mean)).max()))
+        state = task.act(state, i, std=1.0)
+    assert 0 < max(largest) < 0.02
+
+
+@pytest.mark.parametrize("task", envs.TASKS)
+def test_parameter_ratio(task):
+    """A PIDM has about four times the parameters of the task's MLP (paper Sec. IV-A)."""
+    env = envs.make(task, "c")
+    args = finetune.merge(finetune.Args(task=task), env.config.ppo)
+    counts = []
+    for network in ("mlp", "pidm"):
+        net = finetune.make_net(dataclasses.replace(args, network=network), env)
+        shapes = jax.eval_shape(net.init, jax.random.key(0), finetune.zero_inputs(env, net))["params"]
+        counts.append(sum(leaf.size for leaf in jax.tree.leaves(shapes)))
+    assert 3.5 < counts[1] / counts[0] < 4.5, counts
+
+
+def test_normalizer_is_not_trained(pretrained, tmp_path):
+    """Input scaling is fixed: it gets no update, while the weights do."""
+    path = pretrained / "pidm.msgpack"
+    state = finetune.main(finetune.Args(preset="smoke", pretrained=str(path), run_dir=str(tmp_path / "run")))
+    pidm, _ = records.load(path, "PIDM checkpoint")
+    np.testing.assert_array_equal(state.params["normalizer"]["prop_std"], pidm["normalizer"]["prop_std"])
+    backbone = state.params["params"]["actor"]["backbone"]["Dense_0"]["kernel"]
+    assert np.abs(backbone - pidm["params"]["backbone"]["Dense_0"]["kernel"]).max() > 0
+
+
+# --- bad input ---
+
+
+def refused(capsys, run, args, *words):
+    """Exit code 2 and one line on stderr that holds these words."""
+    with pytest.raises(SystemExit) as stop:
+        run(args)
+    err = capsys.readouterr().err
+    assert stop.value.code == 2 and err.count("\n") == 1 and err.startswith("error: "), err
+    for word in words:
+        assert word in err, err
+
+
+def test_bad_datasets_are_refused(tmp_path, capsys):
+    def check(folder, *words):
+        out = tmp_path / "out"
+        refused(capsys, script.main, script.Args(data=str(folder), preset="smoke", run_dir=str(out)), *words)
+        assert not out.exists()
+
+    check(tmp_path / "none", "not a folder")
+    folder = random_dataset(tmp_path / "a")
+    meta = (folder / "meta.json").read_text()
+    (folder / "meta.json").unlink()
+    check(folder, "unfinished collection")
+    (folder / "meta.json").write_text(meta[:40])
+    check(folder, "meta.json is damaged")
+    (folder / "meta.json").write_text(meta)
+    whole = (folder / "x.npy").read_bytes()
+    (folder / "x.npy").write_bytes(whole[:-100])
+    check(folder, "cannot read", "x.npy")
+    np.save(folder / "x.npy", np.array([{"a": 1}], object), allow_pickle=True)
+    check(folder, "cannot read", "x.npy")  # never unpickled
+    (folder / "x.npy").write_bytes(whole)
+    check(random_dataset(tmp_path / "b", robot="spot"), "'spot'")
+    check(random_dataset(tmp_path / "c", robot="g1"), "x.npy", "30", "64")
+    check(random_dataset(tmp_path / "d", layout=["gravity"]), "gravity")
+    check(random_dataset(tmp_path / "e", validation_envs=[]), "validation")
+
+
+def test_too_many_samples_are_refused(tmp_path, capsys):
+    folder = random_dataset(tmp_path / "a")
+    args = script.Args(data=str(folder), preset="smoke", num_samples=10**6, run_dir=str(tmp_path / "out"))
+    refused(capsys, script.main, args, "--num-samples 1000000")
+
+
+def test_bad_checkpoints_are_refused(pretrained, tmp_path, capsys):
+    path = pretrained / "pidm.msgpack"
+    params, meta = records.load(path, "PIDM checkpoint")
+
+    def check(checkpoint, *words, task="go1_loco", **more):
+        out = tmp_path / "out"
+        args = finetune.Args(task=task, preset="smoke", pretrained=str(checkpoint), run_dir=str(out), **more)
+        refused(capsys, finetune.main, args, *words)
+        assert not (out / "metrics.csv").exists()
+
+    check(path, "robot go1", "robot anymal_d", task="anymal_loco")
+    check(path, "--network mlp", network="mlp")
+    check(tmp_path / "none", "cannot read PIDM checkpoint")
+    for name, value in (("layout", ["gravity"]), ("history", 3)):
+        other = tmp_path / f"{name}.msgpack"
+        records.save(other, params, meta | {name: value})
+        check(other, f"{name} {value}", f"{name} {meta[name]}")
+    cut = tmp_path / "cut.msgpack"
+    cut.write_bytes(path.read_bytes()[:-50])
+    check(cut, "damaged")
+    policy = tmp_path / "policy.msgpack"
+    records.save(policy, params, {"task": "go1_loco", "args": {}})
+    check(policy, "not a PIDM checkpoint")
+    small = tmp_path / "small.msgpack"
+    records.save(small, jax.tree.map(lambda x: x[..., :-1], params), meta)
+    check(small, "this task needs")
+
+
+def test_init_without_pretrained_is_refused(capsys):
+    refused(capsys, finetune.main, finetune.Args(preset="smoke", init="shuffled"), "--init shuffled needs --pretrained")
