@@ -217,9 +217,11 @@ G1_LOCO = LocomotionConfig(
     weights={
         "track_lin_vel": 1.0,
         "track_yaw_rate": 1.0,
-        # Deviation: with Isaac Lab's 0.75 and no flight term it hops on both feet; its single torso joint cannot bow.
+        # Deviation: with Isaac Lab's 0.75 and no flight term it hops on both feet; without one_foot and air_time it
+        # shuffles on both at once. Isaac Lab's G1 has a single torso joint, which cannot bow.
         "single_stance": 2.0,
         "one_foot": 0.5,
+        "air_time": 1.0,
         "flight": -1.0,
         "slip": -0.1,
         "ankle_limits": -1.0,
@@ -241,6 +243,7 @@ G1_LOCO = LocomotionConfig(
         "cpu": {"num_envs": 256, "total_steps": 8_000_000},
         "gpu": {"total_steps": 147_000_000},
     },
+    air_time_threshold=0.1,
     termination_reward=-2.0,
     lin_vel_x=(0.0, 1.0),
     lin_vel_y=(-0.5, 0.5),

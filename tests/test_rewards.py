@@ -53,9 +53,7 @@ def reference(env, physics, task, action, last_action):
         "alive": 1.0,
     }
     terms["slip"] = sum(np.hypot(*read(f"{f}_vel")[:2]) for f, on in zip(robot.feet, contact, strict=True) if on)
-    if robot.name != "g1":
-        threshold = TASKS[{"anymal_d": "anymal_loco", "go1": "go1_loco"}[robot.name]]["air_threshold"]
-        terms["air_time"] = moving * sum(t - threshold for t in task.landed_after if t > 0)
+    terms["air_time"] = moving * sum(t - AIR_THRESHOLD for t in task.landed_after if t > 0)
     if robot.name == "anymal_d":
         terms["thigh_contact"] = sum(np.linalg.norm(read(f"{leg}_thigh_force")) > 1 for leg in ("LF", "RF", "LH", "RH"))
     if robot.name == "g1":
