@@ -5,6 +5,7 @@ Every file is replaced in one step, so that a stopped run leaves none half-writt
 
 import csv
 import dataclasses
+import functools
 import io
 import json
 import os
@@ -24,8 +25,9 @@ class UserError(Exception):
     """Bad input: printed as one line, exit code 2."""
 
 
+@functools.cache
 def versions():
-    """What a run must name to be repeatable."""
+    """What a run must name to be repeatable, as it was when the process first asked."""
     git = subprocess.run(["git", "describe", "--always", "--dirty", "--abbrev=12"], capture_output=True, text=True)
     return {
         "commit": git.stdout.strip() or "unknown",

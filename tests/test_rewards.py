@@ -6,11 +6,8 @@ import pytest
 
 import envs
 
-TASKS = {
-    "anymal_loco": {"thigh": True, "air_threshold": 0.1},
-    "go1_loco": {"thigh": False, "air_threshold": 0.1},
-    "g1_loco": {"thigh": False, "air_threshold": None},
-}
+TASKS = ("anymal_loco", "go1_loco", "g1_loco")
+AIR_THRESHOLD = 0.1  # [s]
 
 
 def quat_to_matrix(quat):
