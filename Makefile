@@ -1,13 +1,14 @@
-# make demo   train a walking Go1 on this CPU, evaluate it, write pictures
-# make test   everything CI runs but the smoke run of the script
+# make demo   train a walking Go1 on this CPU from the shipped PIDM, evaluate it, write pictures
+# make test   everything CI runs but the smoke runs of the scripts
 PYTHON ?= python3
 BIN = .venv/bin
 
 .PHONY: demo test
 
 demo: .venv/installed
-	$(BIN)/python ppo_finetune.py --task go1_loco --preset cpu --run-dir runs/demo --force
+	$(BIN)/python ppo_finetune.py --task go1_loco --pretrained assets/pidm/go1.msgpack --run-dir runs/demo --force
 	$(BIN)/python ppo_finetune.py --task go1_loco --eval runs/demo/policy.msgpack
+	$(BIN)/python results/report.py --beside runs/demo
 
 test: .venv/installed
 	$(BIN)/ruff check .

@@ -2,10 +2,12 @@
 
     python results/report.py
     python results/report.py --check
+    python results/report.py --beside runs/demo
 
 Metrics are the paper's: final performance (mean return of the last 5% of rows) and iterations to 90% of the final
 performance of PIDM random, both against PIDM random; beside them the area under the curve and the mean action's
-velocity error. Intervals are 95% bootstrap intervals over seeds. --check fails if the README is not what runs give.
+velocity error. Intervals are 95% bootstrap intervals over seeds. --check fails if the README is not what runs give;
+--beside draws a run of yours with the recorded ones of its task.
 """
 
 import csv
@@ -40,6 +42,7 @@ PAPER = {  # Table I: method -> task -> (final performance, iterations to 90 %),
 @dataclass(frozen=True)
 class Args:
     check: bool = False  # compare with the README on disk instead of writing it
+    beside: str | None = None  # a run folder: draw its curve with those of the study
 
 
 def load_run(folder):
@@ -157,8 +160,8 @@ def table(task, runs):
     return lines
 
 
-def draw(tasks, path):
-    """Mean and std of the return over iterations, a panel a task."""
+def draw(tasks, path, extra=None):
+    """Mean and std of the return over iterations, a panel a task; `extra` (label, iteration, return) goes on top."""
     plt = records.pyplot()
     fig, axes = plt.subplots(1, len(tasks), figsize=(5.5 * len(tasks), 3.6), constrained_layout=True, squeeze=False)
     for ax, (task, runs) in zip(axes[0], tasks.items(), strict=True):
@@ -167,6 +170,8 @@ def draw(tasks, path):
             iteration, mean, std = mine[0]["iteration"], curves.mean(0), curves.std(0)
             (line,) = ax.plot(iteration, mean, label=f"{METHODS[method]} ({len(mine)})")
             ax.fill_between(iteration, mean - std, mean + std, alpha=0.15, color=line.get_color())
+        if extra:
+            ax.plot(*extra[1:], color="black", label=extra[0])
         ax.set(title=task, xlabel="PPO iteration", ylabel="episode return")
         ax.grid(alpha=0.3)
         ax.legend(fontsize=8)
@@ -189,6 +194,21 @@ def report(scale):
     return lines, tasks
 
 
+def beside(folder):
+    """Draw a run with the study's of its task into its own folder; UserError if either is missing."""
+    try:
+        task = json.loads((folder / "args.json").read_text())["task"]
+        with (folder / "metrics.csv").open() as file:
+            rows = [(float(row["iteration"]), float(row["episode_return"])) for row in csv.DictReader(file)]
+    except (OSError, ValueError, KeyError) as error:
+        raise records.UserError(f"{folder} is not a run of ppo_finetune.py: {error}") from None
+    if not (STUDY / "cpu" / task).is_dir():
+        raise records.UserError(f"results/study has no runs of {task}")
+    path = folder / "beside_recorded.png"
+    draw({task: load_task(STUDY / "cpu" / task)}, path, ("this run", *zip(*rows, strict=True)))
+    print(f"wrote {path}")
+
+
 HEAD = """# Study
 
 Written by `python results/report.py` from the runs beside it; `--check` compares. Return is that of the noisy policy in
@@ -202,16 +222,23 @@ permuted within each layer: the same scale, no knowledge.
 
 def main(args):
     """Write the report, or with --check exit 1 where it differs from the one on disk."""
+    if args.beside:
+        return beside(Path(args.beside))
     lines, tasks = report("cpu")
     text = "\n".join([HEAD, *lines]).rstrip() + "\n"
     if args.check:
         if (STUDY / "README.md").read_text() != text:
             sys.exit("results/study/README.md is not what the runs give; run results/report.py")
-        return
+        return None
     records.replace_text(STUDY / "README.md", text)
     draw(tasks, STUDY / "curves.png")
     print(text)
+    return None
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args, description=__doc__))
+    try:
+        main(tyro.cli(Args, description=__doc__))
+    except records.UserError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)

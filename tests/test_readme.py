@@ -10,13 +10,19 @@ import pytest
 import tyro
 
 import envs
+import ppo_explore
 import ppo_finetune
+import pretrain_pidm
 
 ROOT = Path(__file__).resolve().parent.parent
 README = (ROOT / "README.md").read_text()
 BLOCKS = re.findall(r"```(\w+)\n(.*?)```", README, re.S)
 COMMANDS = [line for language, body in BLOCKS if language == "bash" for line in body.strip().splitlines()]
-SCRIPTS = {"ppo_finetune.py": ppo_finetune.Args}
+SCRIPTS = {
+    "ppo_explore.py": ppo_explore.Args,
+    "pretrain_pidm.py": pretrain_pidm.Args,
+    "ppo_finetune.py": ppo_finetune.Args,
+}
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -26,10 +32,14 @@ def test_commands_parse(command):
         assert f"\n{words[1]}:" in (ROOT / "Makefile").read_text()
         return
     assert words[0] == ".venv/bin/python"
-    args = tyro.cli(SCRIPTS[words[1]], args=words[2:])
-    assert args.task in envs.TASKS
-    if args.eval and args.eval.startswith("results"):
-        assert (ROOT / args.eval).exists()
+    if words[1].startswith("results/"):
+        assert (ROOT / words[1]).exists()
+        return
+    args = vars(tyro.cli(SCRIPTS[words[1]], args=words[2:]))
+    assert args.get("task", "go1_loco") in envs.TASKS and args.get("robot", "go1") in envs.EXPLORE
+    for name in ("eval", "pretrained"):
+        if (args.get(name) or "runs").split("/")[0] in ("results", "assets"):
+            assert (ROOT / args[name]).exists()
 
 
 def test_python_runs():
@@ -68,6 +78,15 @@ def test_missing_runs_are_called_missing():
     for task in envs.TASKS.keys() - set(RECORDED):
         row = next(line for line in README.splitlines() if line.startswith(f"| `{task}` |"))
         assert row.endswith("| not recorded yet |")
+
+
+def test_pidm_table_is_what_was_recorded():
+    for robot in envs.EXPLORE:
+        result = json.loads((ROOT / f"results/pidm/{robot}/validation.json").read_text())
+        row = next(line for line in README.splitlines() if line.startswith(f"| {robot} |"))
+        figures = [f"{result[name]:.3f}" for name in ("error", "error_rad", "normalized_error")]
+        figures += [f"{result[name]:.2f}" for name in ("mean_action_error", "last_action_error")]
+        assert row == f"| {robot} | " + " | ".join(figures) + " |"
 
 
 def test_speed_table_is_what_was_measured():

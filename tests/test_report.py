@@ -1,0 +1,68 @@
+"""The report's metrics on curves whose answers are known by hand, and runs that it must leave out."""
+
+import json
+
+import numpy as np
+import pytest
+
+from results import report
+
+
+def curve(values):
+    return {"iteration": np.arange(1.0, len(values) + 1), "return": np.asarray(values, float)}
+
+
+def test_final_is_the_mean_of_the_last_twentieth():
+    assert report.final(curve([*[0.0] * 38, 4.0, 6.0])) == 5.0
+    assert report.final(curve([1.0, 2.0])) == 2.0
+
+
+def test_iterations_to_a_level():
+    """Rises 1 an iteration: the mean of five rows that ends at iteration i is i - 2."""
+    rising = curve(np.arange(1.0, 41.0))
+    assert report.iterations_to(rising, 10.0) == 12
+    assert np.isnan(report.iterations_to(rising, 100.0))
+
+
+def test_interval_by_hand():
+    assert report.interval([11.0, 11.0], [10.0, 10.0]) == "+10.0 [+10.0, +10.0]"
+    assert report.interval([5.0], [10.0]) == "-50.0"
+    low, high = report.interval([8.0, 12.0], [10.0, 10.0]).split("[")[1].rstrip("]").split(", ")
+    assert (float(low), float(high)) == (-20.0, 20.0)
+
+
+def test_unreached_levels_are_said():
+    assert report.against_random([np.nan, 3.0], [2.0, 2.0], False) == "not reached by 1 of 2"
+
+
+@pytest.fixture
+def study(tmp_path, monkeypatch):
+    """Two methods of one seed each."""
+    monkeypatch.setattr(report, "ROOT", tmp_path)
+    args = {"num_envs": 2, "num_steps": 5, "total_steps": 40, "lr": 1.0, "num_epochs": 5, "mirror_coef": 0.1}
+    args |= {"config": {}, "seed": 0, "versions": {"machine": "m"}}
+    for method in ("mlp", "pidm_random"):
+        folder = tmp_path / method / "seed0"
+        folder.mkdir(parents=True)
+        (folder / "args.json").write_text(json.dumps(args))
+        (folder / "eval.json").write_text(json.dumps({"task": {"lin_vel_error": 0.1, "falls": 0.0}}))
+        rows = [f"{i},{10 * i},{i},{2.0 * i}" for i in range(1, 5)]
+        (folder / "metrics.csv").write_text("\n".join(["iteration,env_steps,seconds,episode_return", *rows]) + "\n")
+    return tmp_path, args
+
+
+def test_bad_runs_are_left_out_with_a_warning(study, capsys):
+    folder, args = study
+    assert set(report.load_task(folder)) == {"mlp", "pidm_random"} and not capsys.readouterr().err
+    target = folder / "pidm_random/seed0"
+    (target / "args.json").write_text(json.dumps(args | {"lr": 2.0}))
+    assert set(report.load_task(folder)) == {"mlp"}
+    assert "other settings" in capsys.readouterr().err
+    (target / "args.json").write_text(json.dumps(args | {"total_steps": 50}))
+    assert set(report.load_task(folder)) == {"mlp"}
+    assert "stopped before its last step" in capsys.readouterr().err
+    (target / "args.json").write_text(json.dumps(args))
+    text = (target / "metrics.csv").read_text()
+    (target / "metrics.csv").write_text(text[:-5] + "\n")
+    assert set(report.load_task(folder)) == {"mlp"}
+    assert "left out" in capsys.readouterr().err
