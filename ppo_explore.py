@@ -520,6 +520,14 @@ def iteration(args, env, net, opt, member, member_opt, state):
     return state, (metrics, data)
 
 
+def init_ensemble(args, member, opt, norm, batch, key):
+    """Fresh members, each from its own key; `batch` gives the shapes."""
+    one = jax.tree.map(lambda x: x[0], batch)
+    inputs = flat_history(norm, one.prop, one.past), one.delta
+    params = jax.vmap(lambda k: member.init(k, *inputs)["params"])(jax.random.split(key, args.members))
+    return Ensemble(params, opt.init(params), norm, jnp.zeros(()))
+
+
 def init_state(args, env, net, opt, member, member_opt):
     """Fresh networks, an empty ring buffer, and N environments whose episode clocks start anywhere."""
     k_net, k_env, k_clock, k_members = jax.random.split(jax.random.key(args.seed), 4)
@@ -535,10 +543,7 @@ def init_state(args, env, net, opt, member, member_opt):
     )
     norm = statistics(jax.tree.map(lambda x: x[:1], empty))
     norm = {name: jnp.ones_like(x) if name.endswith("std") else x for name, x in norm.items()}
-    one = jax.tree.map(lambda x: x[0], empty)
-    inputs = flat_history(norm, one.prop, one.past), one.delta
-    weights = jax.vmap(lambda k: member.init(k, *inputs)["params"])(jax.random.split(k_members, args.members))
-    ensemble = Ensemble(weights, member_opt.init(weights), norm, jnp.zeros(()))
+    ensemble = init_ensemble(args, member, member_opt, norm, empty, k_members)
     first = jnp.ones(args.num_envs, bool)
     return TrainState(
         params, opt.init(params), jnp.float32(args.lr), env_state, first, ensemble, empty, jnp.zeros((), jnp.int32)

@@ -15,12 +15,15 @@ from pathlib import Path
 from typing import Literal
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+import optax
 import tyro
 
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 
+import ppo_explore
 import ppo_finetune
 import pretrain_pidm
 from envs import records
@@ -84,6 +87,44 @@ def occupied(env, x, bins=20):
     return float(np.mean([len(np.unique(cells[:, i] * bins + cells[:, j])) / bins**2 for i, j in pairs]))
 
 
+def transitions(dataset, index):
+    """Windows of a dataset as the ensemble of stage 1 reads them."""
+    w = dataset.windows(np.sort(index))
+    arrays = w["prop"], w["past"], w["next_x"] - w["prop"][:, -1], w["action"]
+    return ppo_explore.Transitions(*map(jnp.asarray, arrays))
+
+
+def novelty(env, dataset, path):
+    """Disagreement of a fresh ensemble trained on the first tenth of a collection: there, and on its last tenth."""
+    rng, tenth = np.random.default_rng(0), len(dataset.train) // 10
+    index = {"seen": rng.permutation(dataset.train[:tenth])[:50_000], "novel": dataset.train[-tenth:]}
+    known = transitions(dataset, index["seen"])
+    probes = {name: transitions(dataset, rng.choice(chosen, 4096, replace=False)) for name, chosen in index.items()}
+    args, member, opt = ppo_explore.Args(), ppo_explore.PIDM(ppo_explore.MEMBER, 2 * env.action_dim), optax.adam(1e-3)
+    ensemble = ppo_explore.init_ensemble(args, member, opt, ppo_explore.statistics(known), known, jax.random.key(0))
+    fit = jax.jit(lambda e, k: ppo_explore.retrain(args, member, opt, e, known, len(known.action), k)[0])
+
+    @jax.jit
+    def doubt(ensemble, batch):
+        return ppo_explore.disagreement(ppo_explore.predict(member, ensemble.params, ensemble.norm, batch)[0]).mean()
+
+    curves = {name: [] for name in probes}
+    for i in range(200):
+        for name, batch in probes.items():
+            curves[name].append(float(doubt(ensemble, batch)))
+        ensemble = fit(ensemble, jax.random.key(i))
+    plt = records.pyplot()
+    fig, ax = plt.subplots(figsize=(4.5, 3), constrained_layout=True)
+    for name, label in (("seen", "trained on (first tenth)"), ("novel", "novel (last tenth)")):
+        ax.semilogy(curves[name], label=label)
+    ax.set(xlabel="retrainings of the ensemble", title="disagreement [action units squared]")
+    ax.legend()
+    ax.grid(alpha=0.3)
+    fig.savefig(path, dpi=110, metadata={"Software": None})
+    plt.close(fig)
+    return {f"disagreement, {name}": values[-1] for name, values in curves.items()}
+
+
 def project(sets):
     """Two-dimensional picture of sets of x_t: UMAP, or PCA where umap-learn is not installed. Name and points."""
     everything = np.concatenate(sets)
@@ -110,9 +151,10 @@ def look(args, robot):
         "random actions": sample(ROOT / random),
         f"first {EARLY} iterations of {task}": early_states(task),
     }
-    coverage = {name: occupied(env, x) for name, x in kinds.items()}
-    print(robot, records.line(coverage))
     kept = ROOT / f"results/pidm/{robot}"
+    coverage = {f"joint space, {name}": occupied(env, x) for name, x in kinds.items()}
+    coverage |= novelty(env, pretrain_pidm.Dataset(ROOT / f"runs/explore/{robot}/seed0"), kept / "novelty.png")
+    print(robot, records.line(coverage))
     records.replace_text(kept / "coverage.json", json.dumps(coverage, indent=1) + "\n")
     name, points = project([x[::5] for x in kinds.values()])
     plt = records.pyplot()

@@ -114,12 +114,8 @@ def fitted():
     member, opt = script.PIDM(script.MEMBER, 24), optax.adam(1e-3)
     buffer = toy(jax.random.key(0), 2048)
     norm = script.statistics(buffer)
-    one = jax.tree.map(lambda x: x[0], buffer)
-    keys = jax.random.split(jax.random.key(1), 3)
-    params = jax.vmap(lambda k: member.init(k, script.flat_history(norm, one.prop, one.past), one.delta)["params"])(
-        keys
-    )
-    ensemble = script.Ensemble(params, opt.init(params), norm, jnp.zeros(()))
+    ensemble = script.init_ensemble(args, member, opt, norm, buffer, jax.random.key(1))
+    params = ensemble.params
     retrain = jax.jit(lambda e, k: script.retrain(args, member, opt, e, buffer, 2048, k))
     losses = []
     for i in range(40):
