@@ -2,8 +2,8 @@
 
     python results/bench.py
 
-bare      the physics engine alone, constant targets, robots standing
-env       the whole environment step under jit: engine, rewards, observations, resets
+bare      the physics engine alone, moved by random joint targets as at the start of a training
+env       the whole environment step under jit: engine, rewards, observations, resets; the same actions
 training  ppo_finetune.py, learning included, after its compilation
 """
 
@@ -22,7 +22,6 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 
 import jax
-import jax.numpy as jnp
 import mujoco
 
 import envs
@@ -45,13 +44,13 @@ def stepping(task, engine, num_envs, length, whole):
     """Control steps per second of the engine alone, or of the whole environment. Returns (steps/s, compile s)."""
     env = envs.make(task, engine)
     state = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), num_envs))
-    stand = jnp.tile(env.default_pose, (num_envs, 1))
-    zero = jnp.zeros((num_envs, env.action_dim))
-    if whole:
-        step, carry = lambda s, _: (jax.vmap(env.step)(s, zero), None), state
-    else:
-        step, carry = lambda p, _: (jax.vmap(env.engine.step)(p, stand), None), state.physics
-    return rate(jax.jit(lambda c: jax.lax.scan(step, c, None, length)[0]), carry, num_envs * length)
+    actions = jax.random.normal(jax.random.key(1), (length, num_envs, env.action_dim))
+    step, carry, inputs = jax.vmap(env.step), state, actions
+    if not whole:
+        targets = env.default_pose + env.robot.action_scale * actions
+        step, carry, inputs = jax.vmap(env.engine.step), state.physics, targets
+    many = jax.jit(lambda c: jax.lax.scan(lambda s, a: (step(s, a), None), c, inputs)[0])
+    return rate(many, carry, num_envs * length)
 
 
 def training(task, num_envs):
@@ -106,7 +105,7 @@ def measure(num_envs):
         rows.append(("compile", task, num_envs, compile_s, "s"))
         rows.append(("start to first row", task, num_envs, to_first, "s"))
         bare = rows[-6][3]
-        speed, compile_s = stepping(task, "mjx", 64, 2, False)
+        speed, compile_s = stepping(task, "mjx", 64, 10, False)
         rows.append(("bare, engine mjx", task, 64, speed, "steps/s"))
         rows.append(("compile, engine mjx", task, 64, compile_s, "s"))
         rows.append(("engine c over mjx", task, "", bare / speed, "x"))
