@@ -335,7 +335,8 @@ def log_prob(mean, log_std, action):
 def step_metrics(env_state, done):
     """Means over environments, and sums over the episodes that ended in this step."""
     metrics = dict(env_state.metrics)
-    ended = {f"sum/{name}": jnp.sum(metrics.pop(name) * done) for name in ("episode_return", "episode_seconds")}
+    names = [name for name in metrics if name.startswith("episode_")]
+    ended = {f"sum/{name}": jnp.sum(metrics.pop(name) * done) for name in names}
     ended |= {"sum/falls": env_state.terminated.sum(), "sum/episodes": done.sum()}
     return {name: value.mean() for name, value in metrics.items()} | {"reward": env_state.reward.mean()} | ended
 

@@ -50,7 +50,8 @@ class Args:
     log_every: int | None = None  # iterations per jitted chunk and CSV row
     # --- Evaluation ---
     eval: str | None = None  # a policy.msgpack: run it instead of training, write pictures beside it
-    eval_envs: int = 64  # episodes of the evaluation
+    eval_envs: int = 64  # episodes of the evaluation, of each level where a task has levels
+    level: int | None = None  # level of the evaluation and its pictures; None: all levels, pictures of level 4
     # --- Environment ---
     num_envs: int | None = None  # N
     num_steps: int | None = None  # T, per iteration and environment
@@ -356,7 +357,8 @@ def log_prob(mean, log_std, action):
 def step_metrics(env_state, done):
     """Means over environments, and sums over the episodes that ended in this step."""
     metrics = dict(env_state.metrics)
-    ended = {f"sum/{name}": jnp.sum(metrics.pop(name) * done) for name in ("episode_return", "episode_seconds")}
+    names = [name for name in metrics if name.startswith("episode_")]
+    ended = {f"sum/{name}": jnp.sum(metrics.pop(name) * done) for name in names}
     ended |= {"sum/falls": env_state.terminated.sum(), "sum/episodes": done.sum()}
     return {name: value.mean() for name, value in metrics.items()} | {"reward": env_state.reward.mean()} | ended
 
@@ -553,28 +555,29 @@ def init_state(args, env, net, opt):
 # --- Evaluation ---
 
 
-def evaluate(env, net, params, num_envs):
-    """One episode per environment with the mean action, fixed seed. Metrics, and the first one's qpos (steps, nq)."""
+def evaluate(env, net, params, num_envs, level=None):
+    """One episode per environment with the mean action, fixed seed. Metrics, first physics, its qpos (steps, nq)."""
 
     def step(carry, _):
         env_state, alive = carry
         action = net.apply(params, net_inputs(net, env_state.obs, env_state.history), method=net.mean)
         env_state = jax.vmap(env.step)(env_state, action)
         done = env_state.terminated | env_state.truncated
-        out = (env_state.metrics, env_state.reward), alive, env_state.terminated & alive, env_state.physics.qpos[0]
+        out = env_state.metrics, alive, done & alive, env_state.terminated & alive, env_state.physics.qpos[0]
         return (env_state, alive & ~done), out
 
-    env_state = jax.vmap(env.reset)(jax.random.split(jax.random.key(1), num_envs))
+    start = {} if level is None else {"curriculum": env.at_level(level)}
+    env_state = jax.vmap(partial(env.reset, **start))(jax.random.split(jax.random.key(1), num_envs))
     carry = env_state, jnp.ones(num_envs, bool)
-    _, ((metrics, reward), alive, fell, qpos) = jax.lax.scan(step, carry, None, env.episode_steps)
-    metrics = {name: v for name, v in metrics.items() if not name.startswith(("episode", "reward/"))}
-    result = {name: (v * alive).sum() / alive.sum() for name, v in metrics.items()}
-    result |= {
-        "episode_return": (reward * alive).sum(0).mean(),
-        "episode_seconds": alive.sum(0).mean() * env.dt,
-        "falls": fell.any(0).mean(),
-    }
-    return result, qpos
+    _, (metrics, alive, ended, fell, qpos) = jax.lax.scan(step, carry, None, env.episode_steps)
+    result = {}
+    for name, v in metrics.items():
+        if name.startswith("episode_"):
+            result[name] = (v * ended).sum() / ended.sum()
+        elif not name.startswith("reward/"):
+            result[name] = (v * alive).sum() / alive.sum()
+    result["falls"] = fell.any(0).mean()
+    return result, jax.tree.map(lambda x: x[0], env_state.physics), qpos
 
 
 def run_eval(args):
@@ -587,20 +590,38 @@ def run_eval(args):
         raise records.UserError(
             f"{path} is a policy for {meta['task']}, not for {args.task}; pass --task {meta['task']}"
         )
-    env, show = make_env(args), make_env(args, **envs.TASKS[args.task][0].SHOWCASE)
+    env, show = make_env(args), make_env(args, **showcase(args))
     trained = {name: meta["args"][name] for name in ("network", "init_std")}
     net = make_net(dataclasses.replace(args, **trained, hidden=tuple(meta["args"]["hidden"])), env)
     like = jax.eval_shape(net.init, jax.random.key(0), zero_inputs(env, net))
     records.check_shapes(path, params, like)
-    result, _ = jax.jit(lambda p: evaluate(env, net, p, args.eval_envs))(params)
-    showcase, qpos = jax.jit(lambda p: evaluate(show, net, p, min(args.eval_envs, 16)))(params)
-    print(f"{args.eval_envs} episodes of {args.task}, mean action:", records.line(result))
-    print(f"showcase {show.SHOWCASE}:", records.line(showcase))
-    report = {"task": result, "showcase": showcase | {"config": show.SHOWCASE}}
-    report = jax.tree.map(lambda x: float(x) if isinstance(x, jax.Array) else x, report)
+    report = {}
+    run = jax.jit(lambda params, level: evaluate(env, net, params, args.eval_envs, level)[0])
+    for level in levels(args, env):
+        name = "task" if level is None else f"level {level}"
+        report[name] = run(params, level)
+        print(f"{args.eval_envs} episodes of {args.task}, {name}, mean action:", records.line(report[name]))
+    shown, start, qpos = jax.jit(lambda p: evaluate(show, net, p, min(args.eval_envs, 16)))(params)
+    print(f"showcase {showcase(args)}:", records.line(shown))
+    report = jax.tree.map(float, report | {"showcase": shown}) | {"showcase_config": showcase(args)}
     records.replace_text(path.with_name("eval.json"), json.dumps(report, indent=1) + "\n")
-    for picture in render.film(show, qpos, path.parent):
+    for picture in render.film(show, qpos, start, path.parent, **show.FILM):
         print(f"wrote {picture}")
+
+
+def levels(args, env):
+    """Levels to evaluate; None for a task that has none."""
+    if not hasattr(env, "at_level"):
+        if args.level is not None:
+            raise records.UserError(f"{args.task} has no levels; leave out --level")
+        return [None]
+    return range(env.LEVELS) if args.level is None else [args.level]
+
+
+def showcase(args):
+    """Config fields of the pictured episode."""
+    fields = envs.TASKS[args.task][0].SHOWCASE
+    return fields | {"level": args.level} if "level" in fields and args.level is not None else fields
 
 
 # --- Records ---
@@ -614,12 +635,12 @@ def make_env(args, **overrides):
         raise records.UserError(str(error)) from None
 
 
-SHOWN = ("episode_return", "fall_rate", "lin_vel_error", "kl", "action_std")  # in the printed line
+SHOWN = ("episode_return", "fall_rate", "lin_vel_error", "foot_error", "progress", "kl", "action_std")  # if there
 
 
 def plot(rows, path):
     """Return, fall rate, task metrics, action std and reward terms over environment steps."""
-    errors = [name for name in rows[0] if name.endswith("_error")]
+    errors = [name for name in rows[0] if name.endswith("_error") or name in ("progress", "episode_success")]
     terms = [name for name in rows[0] if name.startswith("reward/")]
     names = ("episode_return", "fall_rate", *errors, "action_std")
     records.plot_curves(rows, names, {"reward terms per step": terms}, path)

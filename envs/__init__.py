@@ -1,6 +1,6 @@
 """Robot tasks. `envs.make("go1_loco")` is all a script needs; `envs.TASKS` lists the names, `envs.EXPLORE` robots."""
 
-from envs import locomotion
+from envs import locomotion, parkour, pedipulation
 from envs.base import replace_checked
 from envs.explore import EXPLORE, Explore
 
@@ -8,6 +8,12 @@ TASKS = {
     "anymal_loco": (locomotion.AnymalLocomotion, locomotion.ANYMAL_LOCO),
     "go1_loco": (locomotion.Locomotion, locomotion.GO1_LOCO),
     "g1_loco": (locomotion.G1Locomotion, locomotion.G1_LOCO),
+    "anymal_pedipulation": (pedipulation.Pedipulation, pedipulation.ANYMAL_PEDIPULATION),
+    "anymal_parkour_walk": (parkour.Parkour, parkour.WALK),
+    "anymal_climb_up": (parkour.Parkour, parkour.CLIMB_UP),
+    "anymal_climb_down": (parkour.Parkour, parkour.CLIMB_DOWN),
+    "anymal_crouch": (parkour.Parkour, parkour.CROUCH),
+    "anymal_jump": (parkour.Parkour, parkour.JUMP),
 }
 
 

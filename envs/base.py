@@ -44,7 +44,8 @@ class Config:
     friction: tuple[float, float] = (0.7, 0.7)
     added_mass: tuple[float, float] = (0.0, 0.0)  # [kg] on the base
     link_mass: tuple[float, float] = (1.0, 1.0)  # factor on each link's mass and inertia
-    push_velocity: float = 0.0  # [m/s] half-width of a sudden change of horizontal velocity
+    push_velocity: float = 0.0  # [m/s, rad/s] half-width of a sudden change of the base's velocity
+    push_axes: int = 2  # 2: its horizontal velocity, 6: all six components
     push_seconds: tuple[float, float] = (10.0, 15.0)  # time between pushes
 
 
@@ -76,6 +77,15 @@ class State:
 
 
 @flax.struct.dataclass
+class Course:
+    """What is drawn before an episode starts; a task family may add to it (a goal)."""
+
+    mocap_pos: jax.Array  # (M, 3) [m] obstacles
+    mocap_quat: jax.Array  # (M, 4)
+    curriculum: dict  # what an environment keeps from episode to episode (its level)
+
+
+@flax.struct.dataclass
 class Motion:
     """True kinematics, computed from qpos and qvel; forces and feet from the engine's sensors."""
 
@@ -85,13 +95,18 @@ class Motion:
     joint_pos: jax.Array  # (A,) minus the default pose [rad]
     joint_vel: jax.Array  # (A,)
     joint_acc: jax.Array  # (A,)
+    base_acc: jax.Array  # (6,) linear (world), angular (base frame)
     torque: jax.Array  # (A,) [N m]
+    base_pos: jax.Array  # (3,) world [m]
     quat: jax.Array  # (4,) base orientation
     yaw: jax.Array  # () [rad]
     foot_pos: jax.Array  # (F, 3) world
     foot_vel: jax.Array  # (F, 3) world
+    foot_force: jax.Array  # (F, 3) world [N]
     foot_contact: jax.Array  # (F,) bool, more than 1 N
     sensors: jax.Array  # (S,) all readings, for the contact forces of other bodies
+    mocap_pos: jax.Array  # (M, 3) obstacles
+    mocap_quat: jax.Array  # (M, 4)
 
 
 @flax.struct.dataclass
@@ -163,6 +178,7 @@ class Env:
     OBS: dict[str, tuple] = {}
     bootstrap_time_outs = True  # V(final_obs) follows a time limit; not where the policy sees the time left
     SHOWCASE: dict = {}  # config fields for the pictures of a trained policy
+    FILM: dict = {}  # which part of an episode they show; see render.film
 
     def __init__(self, config, engine="auto"):
         self.config, self.robot = config, ROBOTS[config.robot]
@@ -191,11 +207,28 @@ class Env:
         """MjSpec of the robot and its ground."""
         return terrain.flat_scene(self.robot, visual)
 
-    def init_task(self, key, physics):
+    def first_curriculum(self):
+        """What an environment starts its first episode with."""
+        return {}
+
+    def graduate(self, key, task, motion, terminated, truncated):
+        """The curriculum after an episode that ends like this."""
+        return {}
+
+    def first_clock(self, key):
+        """Control steps that have passed when an episode begins; more where episodes have random lengths."""
+        return 0
+
+    def course(self, key, curriculum):
+        """Obstacles (and goal) of an episode."""
+        nowhere = self.engine.initial(*[jnp.zeros(())] * 4)
+        return Course(nowhere.mocap_pos, nowhere.mocap_quat, curriculum)
+
+    def init_task(self, key, physics, course):
         """The task's own state at the start of an episode."""
         raise NotImplementedError
 
-    def ground_height(self, xy):
+    def ground_height(self, course, xy):
         """Height of the ground [m] at horizontal positions (..., 2)."""
         return jnp.zeros(xy.shape[:-1])
 
@@ -209,7 +242,7 @@ class Env:
         """Bring the task state up to this step's motion, before rewards."""
         return task.tick(motion.foot_contact, self.dt)
 
-    def rewards(self, task, motion, action, last_action):
+    def rewards(self, task, motion, action, last_action, clock):
         """Reward terms by name, unweighted, per second; those without a weight are ignored."""
         raise NotImplementedError
 
@@ -222,20 +255,22 @@ class Env:
         """Task state for the next step (commands), after rewards."""
         return task
 
-    def task_metrics(self, task, motion):
+    def task_metrics(self, task, motion, truncated):
         """Numbers to log, by name."""
         return {}
 
     # --- shared ---
 
-    def reset(self, key, clock=0):
+    def reset(self, key, clock=None, curriculum=None):
         """Start an episode. `clock` (steps) lets a first episode start midway, so that time-outs spread out."""
-        k_spawn, k_task, k_sense, k_push, key = jax.random.split(key, 5)
-        physics = self.spawn(k_spawn)
-        task = self.init_task(k_task, physics)
-        action, clock = jnp.zeros(self.action_dim), jnp.asarray(clock, jnp.int32)
-        sensed, prop = self.sense(k_sense, self.motion(physics))
-        obs = self.observe(sensed, task, action)
+        k_course, k_clock, k_spawn, k_task, k_sense, k_push, key = jax.random.split(key, 7)
+        course = self.course(k_course, self.first_curriculum() if curriculum is None else curriculum)
+        physics = self.spawn(k_spawn, course)
+        task = self.init_task(k_task, physics, course)
+        clock = jnp.asarray(self.first_clock(k_clock) if clock is None else clock, jnp.int32)
+        action, motion = jnp.zeros(self.action_dim), self.motion(physics)
+        sensed, prop = self.sense(k_sense, motion, task)
+        obs = self.observe(sensed, task, action, motion, clock)
         history = {
             "prop": jnp.tile(prop, (self.config.history + 1, 1)),
             "action": jnp.zeros((self.config.history, self.action_dim)),
@@ -256,21 +291,20 @@ class Env:
             episode_return=zero,
             key=key,
             task=task,
-            metrics=self.metrics(no, {name: zero for name in self.config.weights}, task, self.motion(physics)),
+            metrics=self.metrics(no, {name: zero for name in self.config.weights}, task, motion, no),
         )
 
     def step(self, state, action):
         """One control step of 20 ms, with automatic reset. action (A,)."""
-        key, k_sense, k_task, k_push, k_reset = jax.random.split(state.key, 5)
+        key, k_sense, k_task, k_push, k_grade, k_reset = jax.random.split(state.key, 6)
         physics = self.engine.step(state.physics, self.default_pose + self.robot.action_scale * action)
         healthy = jnp.all(jnp.abs(physics.qpos) < BLOWN_UP) & jnp.all(jnp.abs(physics.qvel) < BLOWN_UP)  # false for NaN
-        fresh = self.reset(k_reset)
-        physics = select(healthy, physics, fresh.physics)  # a diverged robot must not poison the batch
+        physics = select(healthy, physics, state.physics)  # a diverged robot must not poison the batch
 
         # rewards and termination, on the true state
         motion = self.motion(physics)
         task = self.track(state.task, motion)
-        terms = self.rewards(task, motion, action, state.action)
+        terms = self.rewards(task, motion, action, state.action, state.clock)
         terms = {
             name: jnp.asarray(weight * terms[name] * self.dt, jnp.float32)
             for name, weight in self.config.weights.items()
@@ -280,16 +314,17 @@ class Env:
         reward += self.config.termination_reward * terminated
         clock = state.clock + 1
         truncated = (clock >= self.episode_steps) & ~terminated
-        metrics = self.metrics(~healthy, terms, task, motion)
+        metrics = self.metrics(~healthy, terms, task, motion, truncated)
+        fresh = self.reset(k_reset, curriculum=self.graduate(k_grade, task, motion, terminated, truncated))
 
         # what the robot sees next
         physics, push_at = self.push(k_push, physics, clock, state.push_at)
         motion = self.motion(physics)
         task = self.advance(k_task, task, motion, clock)
-        sensed, prop = self.sense(k_sense, motion)
+        sensed, prop = self.sense(k_sense, motion, task)
         stepped = state.replace(
             physics=physics,
-            obs=self.observe(sensed, task, action),
+            obs=self.observe(sensed, task, action, motion, clock),
             history={
                 "prop": jnp.concatenate([state.history["prop"][1:], prop[None]]),
                 "action": jnp.concatenate([state.history["action"], action[None]])[1:],
@@ -311,12 +346,15 @@ class Env:
             | {"episode_return": stepped.episode_return, "episode_seconds": clock.astype(jnp.float32) * self.dt},
         )
 
-    def metrics(self, diverged, terms, task, motion):
-        """What one step reports: weighted reward terms, the task's metrics, divergence, the finished episode."""
-        report = {f"reward/{name}": value for name, value in terms.items()} | self.task_metrics(task, motion)
+    def metrics(self, diverged, terms, task, motion, truncated):
+        """What one step reports: weighted reward terms, the task's metrics, divergence, the finished episode.
+
+        Names that start with `episode_` count where an episode ends, all others in every step.
+        """
+        report = {f"reward/{name}": value for name, value in terms.items()} | self.task_metrics(task, motion, truncated)
         return report | {"diverged": diverged, "episode_return": jnp.zeros(()), "episode_seconds": jnp.zeros(())}
 
-    def spawn(self, key):
+    def spawn(self, key, course):
         """Physics at the start of an episode: default pose, random place and heading, feet on the ground."""
         c, m = self.config, self.model
         k_place, k_link, k_joint, k_vel, k_friction, k_mass = jax.random.split(key, 6)
@@ -326,14 +364,15 @@ class Env:
         xy, yaw = self.place(k_place)
         quat = axis_angle(jnp.array([0.0, 0, 1]), yaw)
         feet = rotate(quat, self.feet_in_base(joints))
-        height = jnp.max(self.ground_height(xy + feet[:, :2]) + self.robot.sole - feet[:, 2])
+        height = jnp.max(self.ground_height(course, xy + feet[:, :2]) + self.robot.sole - feet[:, 2])
         qpos = jnp.concatenate([xy, height[None], quat, joints])
         base_vel = uniform(k_vel, -c.spawn_velocity, c.spawn_velocity, (6,))
         qvel = jnp.concatenate([base_vel, jnp.zeros(self.action_dim)])
         base = 1  # the first body after the world
         added = uniform(k_mass, *c.added_mass)
         mass_scale = uniform(k_link, *c.link_mass, (m.nbody,)).at[base].add(added / m.body_mass[base])
-        return self.engine.initial(qpos, qvel, uniform(k_friction, *c.friction), mass_scale)
+        physics = self.engine.initial(qpos, qvel, uniform(k_friction, *c.friction), mass_scale)
+        return physics.replace(mocap_pos=course.mocap_pos, mocap_quat=course.mocap_quat)
 
     def push_interval(self, key):
         """Control steps until the next push."""
@@ -343,9 +382,10 @@ class Env:
         """Disturb the robot: change the horizontal base velocity at once, when it is time."""
         k_vel, k_next = jax.random.split(key)
         now = clock >= push_at
-        kick = uniform(k_vel, -self.config.push_velocity, self.config.push_velocity, (2,)) * now
+        axes = self.config.push_axes
+        kick = uniform(k_vel, -self.config.push_velocity, self.config.push_velocity, (axes,)) * now
         push_at = jnp.where(now, clock + self.push_interval(k_next), push_at)
-        return physics.replace(qvel=physics.qvel.at[:2].add(kick)), push_at
+        return physics.replace(qvel=physics.qvel.at[:axes].add(kick)), push_at
 
     def motion(self, physics):
         """True kinematics of a simulation."""
@@ -359,16 +399,21 @@ class Env:
             joint_pos=physics.qpos[7:] - self.default_pose,
             joint_vel=physics.qvel[6:],
             joint_acc=physics.qacc[6:],
+            base_acc=physics.qacc[:6],
             torque=physics.torque,
+            base_pos=physics.qpos[:3],
             quat=quat,
             yaw=yaw_of(quat),
             foot_pos=physics.sensors[self.sensors["pos"]],
             foot_vel=physics.sensors[self.sensors["vel"]],
+            foot_force=force,
             foot_contact=jnp.linalg.norm(force, axis=-1) > 1.0,
             sensors=physics.sensors,
+            mocap_pos=physics.mocap_pos,
+            mocap_quat=physics.mocap_quat,
         )
 
-    def sense(self, key, motion):
+    def sense(self, key, motion, task):
         """Noisy readings by name, and x_t (X,) made of them."""
         sensed = {}
         for name, key_one in zip(NOISE, jax.random.split(key, len(NOISE)), strict=True):
@@ -376,15 +421,15 @@ class Env:
             sensed[name] = true + uniform(key_one, -width, width, true.shape)
         return sensed, jnp.concatenate([sensed[name] for name in PROP])
 
-    def observe(self, sensed, task, action):
+    def observe(self, sensed, task, action, motion, clock):
         """Observation (O,): noisy readings, task inputs and last action, each times its fixed scale."""
-        blocks = sensed | self.task_inputs(task, sensed) | {"action": action}
+        blocks = sensed | self.task_inputs(task, motion, clock) | {"action": action}
         return jnp.concatenate(
             [jnp.atleast_1d(blocks[name] * jnp.array(scale)) for name, (_, scale) in self.OBS.items()]
         )
 
-    def task_inputs(self, task, sensed):
-        """Exact observation blocks that are the task's own (commands)."""
+    def task_inputs(self, task, motion, clock):
+        """Observation blocks that are the task's own (commands, scans)."""
         return {}
 
     # --- kinematics ---
@@ -413,15 +458,21 @@ class Env:
 
     def width(self, kind):
         """Length of an observation block."""
-        return self.action_dim if kind == "joint" else 3
+        return {"joint": self.action_dim, "scalar": 1, "heading": 2}.get(kind, 3)
 
     def mirror_block(self, mirror, kind):
         """perm, sign of one block of an observation."""
         polar, axial = POLAR[mirror], AXIAL[mirror]
         if kind == "joint":
             return self.robot.mirror_joints(mirror)
-        signs = {"polar": polar, "axial": axial, "planar": np.array([polar[0], polar[1], axial[2]])}
-        return np.arange(3), signs[kind]
+        signs = {
+            "polar": polar,
+            "axial": axial,
+            "planar": np.array([polar[0], polar[1], axial[2]]),
+            "scalar": np.array([1]),
+            "heading": np.array([-1, 1]),  # sine and cosine of an angle about z
+        }
+        return np.arange(len(signs[kind])), signs[kind]
 
     def mirror_tables(self, mirror):
         """perm, sign for `obs`, `prop` and `action` vectors: mirrored = sign * original[perm]."""

@@ -42,7 +42,7 @@ class Explore(Env):
     def scene(self, visual=False):
         return terrain.rough_scene(self.robot, self.heights, visual)
 
-    def ground_height(self, xy):
+    def ground_height(self, course, xy):
         """Bilinear in the field's grid, 0 beside it."""
         at = (xy - jnp.array([terrain.ROUGH_CENTRE, 0.0]) + terrain.ROUGH_HALF) / terrain.CELL
         rows_cols = jnp.moveaxis(at[..., ::-1], -1, 0)
@@ -69,11 +69,11 @@ class Explore(Env):
         wrench = physics.wrench.at[1, :3].set(jnp.where(changes, force, physics.wrench[1, :3]))
         return physics.replace(wrench=wrench), push_at
 
-    def init_task(self, key, physics):
+    def init_task(self, key, physics, course):
         feet = jnp.zeros(len(self.robot.feet))
         return FootClocks(feet, feet, feet)
 
-    def rewards(self, task, motion, action, last_action):
+    def rewards(self, task, motion, action, last_action, clock):
         return {
             "action": rewards.square(action),
             "action_rate": rewards.square(action - last_action),

@@ -55,7 +55,7 @@ class Locomotion(Env):
         self.effort = joint_indices(self.robot, *config.effort_joints)
         self.command_steps = round(config.command_seconds / self.dt)
 
-    def init_task(self, key, physics):
+    def init_task(self, key, physics, course):
         feet = jnp.zeros(len(self.robot.feet))
         command, heading, moves = self.draw_command(key)
         task = Task(feet, feet, feet, command=command, heading=heading, moves=moves)
@@ -82,10 +82,10 @@ class Locomotion(Env):
         task = jax.tree.map(lambda new, old: jnp.where(due, new, old), fresh, task)
         return self.steer(task, motion.yaw)
 
-    def task_inputs(self, task, sensed):
+    def task_inputs(self, task, motion, clock):
         return {"command": task.command}
 
-    def rewards(self, task, motion, action, last_action):
+    def rewards(self, task, motion, action, last_action, clock):
         m, c = motion, self.config
         return {
             "track_lin_vel": rewards.track_lin_vel(task.command[:2], m.lin_vel[:2]),
@@ -102,7 +102,7 @@ class Locomotion(Env):
             "alive": jnp.ones(()),
         }
 
-    def task_metrics(self, task, motion):
+    def task_metrics(self, task, motion, truncated):
         return {
             "lin_vel_error": jnp.linalg.norm(task.command[:2] - motion.lin_vel[:2]),  # [m/s]
             "yaw_rate_error": jnp.abs(task.command[2] - motion.ang_vel[2]),  # [rad/s]
@@ -116,9 +116,9 @@ class AnymalLocomotion(Locomotion):
         super().__init__(config, engine)
         self.thighs = self.engine.sensor(*(f"{foot.replace('foot', 'thigh')}_force" for foot in self.robot.feet))
 
-    def rewards(self, task, motion, action, last_action):
+    def rewards(self, task, motion, action, last_action, clock):
         thighs = motion.sensors[self.thighs]
-        return super().rewards(task, motion, action, last_action) | {"thigh_contact": rewards.touching(thighs)}
+        return super().rewards(task, motion, action, last_action, clock) | {"thigh_contact": rewards.touching(thighs)}
 
 
 class G1Locomotion(Locomotion):
@@ -132,14 +132,14 @@ class G1Locomotion(Locomotion):
         self.waist = joint_indices(self.robot, "waist")
         self.soft_limits = soft_limits(self.model, 0.9)
 
-    def rewards(self, task, motion, action, last_action):
+    def rewards(self, task, motion, action, last_action, clock):
         m = motion
         low, high = self.soft_limits
         # tracked in the heading frame, so that a leaning or pitching trunk costs no velocity
         upright = axis_angle(jnp.array([0.0, 0, 1]), m.yaw)
         lin_vel, ang_vel = (rotate(inverse(upright), rotate(m.quat, v)) for v in (m.lin_vel, m.ang_vel))
         ankles = (m.joint_pos + self.default_pose)[self.ankles]
-        return super().rewards(task, motion, action, last_action) | {
+        return super().rewards(task, motion, action, last_action, clock) | {
             "track_lin_vel": rewards.track_lin_vel(task.command[:2], lin_vel[:2]),
             "track_yaw_rate": rewards.track_yaw_rate(task.command[2], ang_vel[2]),
             "flight": rewards.flight(m.foot_contact, task.command),

@@ -141,9 +141,9 @@ def save_rows(path, rows):
 def make_row(args, iterations, seconds, metrics):
     """One CSV row from a chunk's metrics (log_every,): means, and means over the episodes that ended."""
     metrics = {name: value.sum() if name.startswith("sum/") else value.mean() for name, value in metrics.items()}
-    episodes = metrics.pop("sum/episodes")
-    ended = {"fall_rate": "falls", "episode_return": "episode_return", "episode_seconds": "episode_seconds"}
-    ended = {name: metrics.pop(f"sum/{key}") / max(episodes, 1) for name, key in ended.items()}
+    episodes, falls = metrics.pop("sum/episodes"), metrics.pop("sum/falls")
+    ended = {name.removeprefix("sum/"): metrics.pop(name) for name in list(metrics) if name.startswith("sum/")}
+    ended = {name: value / max(episodes, 1) for name, value in ({"fall_rate": falls} | ended).items()}
     if not episodes:  # say so, instead of 0
         ended = dict.fromkeys(ended, float("nan"))
     steps = args.num_envs * args.num_steps

@@ -17,8 +17,8 @@ from PIL import Image, ImageDraw
 WIDTH, HEIGHT = 320, 240  # [pixels] of one frame
 
 
-def film(env, qpos, folder, start=4.0, strip_seconds=1.0, strip_frames=10, gif_seconds=4.0):
-    """Write rollout.png (frames of one second) and rollout.gif of qpos (steps, nq). Returns the two paths.
+def film(env, qpos, course, folder, start=4.0, strip_seconds=1.0, strip_frames=10, gif_seconds=4.0):
+    """Write rollout.png (ten frames) and rollout.gif of qpos (steps, nq) on a course. Returns the two paths.
 
     The film starts `start` seconds in, when the robot has found its pace, or earlier if the rollout is short.
     """
@@ -28,7 +28,7 @@ def film(env, qpos, folder, start=4.0, strip_seconds=1.0, strip_frames=10, gif_s
     strip = first + np.round(np.linspace(0, strip_seconds, strip_frames, endpoint=False) / env.dt).astype(int)
     strip = strip[strip < len(qpos)]
     shown = np.unique(np.concatenate([moving, strip]))
-    images = dict(zip(shown, draw(env.scene(visual=True), qpos[shown]), strict=True))
+    images = dict(zip(shown, draw(build(env, course), qpos[shown]), strict=True))
 
     sheet = Image.new("RGB", (WIDTH * 5, HEIGHT * -(-len(strip) // 5)), "white")
     for place_in_sheet, i in enumerate(strip):
@@ -40,6 +40,15 @@ def film(env, qpos, folder, start=4.0, strip_seconds=1.0, strip_frames=10, gif_s
     frames = [images[i].quantize(64) for i in moving]
     frames[0].save(gif, save_all=True, append_images=frames[1:], duration=round(2000 * env.dt), loop=0)
     return png, gif
+
+
+def build(env, course):
+    """MjSpec of an environment's scene, its obstacles where a course (or a Physics) has them."""
+    spec = env.scene(visual=True)
+    slabs = [body for body in spec.bodies if body.mocap]
+    for body, pos, quat in zip(slabs, course.mocap_pos, course.mocap_quat, strict=True):
+        body.pos, body.quat = np.asarray(pos, np.float64), np.asarray(quat, np.float64)
+    return spec
 
 
 def draw(spec, qpos):

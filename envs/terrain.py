@@ -1,9 +1,12 @@
-"""The ground a robot stands on, added to its MJCF: a plane, and beside it a field of Perlin noise.
+"""The ground a robot stands on, added to its MJCF: a plane, a field of Perlin noise, or slabs on mocap bodies.
 
 Contact masks: ground contype 0, conaffinity 1; robot contype 1, conaffinity 0. Without them MJX collides floor
 and obstacles with each other and throws bodies into the air.
 """
 
+from dataclasses import dataclass
+
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 
@@ -70,6 +73,58 @@ def rough_scene(robot, heights, visual=False):
         conaffinity=1,
     )
     return spec
+
+
+@dataclass(frozen=True)
+class Slab:
+    """A box of fixed size on a mocap body of its own; difficulty only moves it, so one model serves all levels."""
+
+    name: str
+    half: tuple[float, float, float]  # [m]
+    ceiling: bool = False  # hangs overhead: part of the ceiling scan, not of the height scan
+
+
+def slab_scene(robot, slabs, floor=0.0, visual=False):
+    """The flat scene with its plane at height `floor` and these slabs, parked out of the way."""
+    spec = flat_scene(robot, visual)
+    spec.geom("floor").pos = [0, 0, floor]
+    colours = ([0.55, 0.5, 0.42, 1], [0.48, 0.44, 0.38, 1])
+    for i, slab in enumerate(slabs):
+        body = spec.worldbody.add_body(name=slab.name, mocap=True, pos=[0, 0, PARKED])
+        body.add_geom(
+            name=slab.name,
+            type=mujoco.mjtGeom.mjGEOM_BOX,
+            size=slab.half,
+            contype=0,
+            conaffinity=1,
+            rgba=[0.3, 0.45, 0.6, 0.6] if slab.ceiling else colours[i % 2],
+        )
+    if visual:  # from outside of the slabs
+        camera = spec.camera("track")
+        camera.pos, camera.alt.xyaxes = [-1.0, -4.0, 1.8], [0.97, -0.24, 0, 0.09, 0.35, 0.93]
+    return spec
+
+
+PARKED = -50.0  # [m] height of a slab that is not used
+
+
+def top_heights(pos, quat, half, xy, floor):
+    """Height [m] of the ground at xy (..., 2): the highest slab top there, or the floor.
+
+    pos (M, 3) and quat (M, 4) of slabs that are turned about y at most, half (M, 3). Only top faces count.
+    """
+    sine, cosine = 2 * quat[:, 0] * quat[:, 2], 1 - 2 * quat[:, 2] ** 2  # of the tilt
+    top = pos + half[:, 2:] * jnp.stack([sine, jnp.zeros_like(sine), cosine], -1)  # middle of the top face
+    away = xy[..., None, :] - top[:, :2]  # (..., M, 2)
+    inside = (jnp.abs(away[..., 0]) <= half[:, 0] * cosine) & (jnp.abs(away[..., 1]) <= half[:, 1])
+    height = top[:, 2] - away[..., 0] * sine / cosine
+    return jnp.max(jnp.where(inside, height, floor), -1, initial=floor)
+
+
+def underside_heights(pos, half, xy):
+    """Height [m] of the lowest ceiling slab over xy (..., 2), infinite where there is none; pos and half (M, 3)."""
+    inside = jnp.all(jnp.abs(xy[..., None, :] - pos[:, :2]) <= half[:, :2], -1)
+    return jnp.min(jnp.where(inside, pos[:, 2] - half[:, 2], jnp.inf), -1, initial=jnp.inf)
 
 
 def decorate(spec):

@@ -1,0 +1,139 @@
+"""Obstacle courses of the five parkour skills: which slabs a scene has, and where a level puts them.
+
+A course is drawn as (poses, goal): poses (M, 4) of slab centres x, y, z [m] and tilt about y [rad] in the order of the
+skill's slabs, and the goal (3,) for the base [m]. The robot starts at x = 0 and faces +x. `t` is the level's difficulty
+from 0 to 1. Sizes and ranges: Hoeller et al. 2023 where published, else ours (Sec. 8 of our task notes).
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+
+from envs.base import uniform
+from envs.terrain import PARKED, Slab
+
+BLOCK = Slab("block", (1.5, 2.0, 1.0))
+NEAR, FAR = (Slab(name, (1.5, 2.0, 0.5)) for name in ("near_platform", "far_platform"))
+TABLE = Slab("table", (0.75, 3.0, 0.25), ceiling=True)
+PLANKS = tuple(Slab(f"plank{i}", (0.15, 2.0, 1.2)) for i in range(8))
+RAMP = Slab("ramp", (2.0, 2.0, 0.5))
+LANDING = Slab("landing", (1.5, 2.0, 1.2))
+TILES = tuple(Slab(f"tile{i}", (0.25, 0.25, 0.15)) for i in range(12))
+
+TREAD, STEPS, SLOPE_LENGTH = 0.30, len(PLANKS), 2 * RAMP.half[0]  # [m]
+ROUGH = 0.2  # share of episodes on rough tiles instead of the obstacle
+
+
+def pose(x, z, tilt=0.0, y=0.0):
+    """One row of poses."""
+    return jnp.stack([jnp.asarray(v, jnp.float32) for v in (x, y, z, tilt)])
+
+
+AWAY = (0.0, 0.0, PARKED, 0.0)
+
+
+def between(t, easy, hard):
+    return easy + t * (hard - easy)
+
+
+def tiles(key, t):
+    """Twelve tiles (12, 4) of random height about the way ahead."""
+    k_x, k_y, k_z = jax.random.split(key, 3)
+    x, y = uniform(k_x, 0.7, 3.5, (12,)), uniform(k_y, -0.8, 0.8, (12,))
+    top = uniform(k_z, 0.0, between(t, 0.02, 0.08), (12,))
+    return jnp.stack([x, y, top - TILES[0].half[2], jnp.zeros(12)], -1)
+
+
+def or_rough(obstacles, without, goal, key, t):
+    """The obstacles with all tiles away, or in a share of the episodes tiles alone and a goal 2 to 4 m ahead."""
+    k_share, k_tiles, k_x = jax.random.split(key, 3)
+    rough = uniform(k_share, 0.0, 1.0) < ROUGH
+    slabs = jnp.where(rough, jnp.array(without), jnp.stack(obstacles))
+    tiled = jnp.where(rough, tiles(k_tiles, t), jnp.array(AWAY))
+    flat_goal = jnp.stack([uniform(k_x, 2.0, 4.0), goal[1], jnp.float32(0.5)])
+    return jnp.concatenate([slabs, tiled]), jnp.where(rough, flat_goal, goal)
+
+
+def climb_up(key, t):
+    """A box of 0.1 to 1.0 m; the goal is on it."""
+    k_x, k_gx, k_gy, k_rough = jax.random.split(key, 4)
+    x, height = uniform(k_x, 1.0, 1.5), between(t, 0.1, 1.0)
+    goal = jnp.stack([x + uniform(k_gx, 1.0, 1.5), uniform(k_gy, -0.3, 0.3), height + 0.5])
+    return or_rough([pose(x + 1.5, height - 1.0)], [AWAY], goal, k_rough, t)
+
+
+def climb_down(key, t):
+    """The robot starts on a box of 0.1 to 1.0 m; the goal is on the floor before it."""
+    k_x, k_gx, k_gy, k_rough = jax.random.split(key, 4)
+    x, height = uniform(k_x, 0.7, 1.0), between(t, 0.1, 1.0)
+    goal = jnp.stack([x + uniform(k_gx, 1.2, 1.8), uniform(k_gy, -0.3, 0.3), jnp.float32(0.5)])
+    return or_rough([pose(x - 1.5, height - 1.0)], [AWAY], goal, k_rough, t)
+
+
+def crouch(key, t):
+    """A table whose underside is 0.9 to 0.4 m above the floor; the goal is behind it."""
+    k_x, k_gx, k_gy, k_rough = jax.random.split(key, 4)
+    x, clearance = uniform(k_x, 1.0, 1.5), between(t, 0.9, 0.4)
+    goal = jnp.stack([x + 1.5 + uniform(k_gx, 0.8, 1.2), uniform(k_gy, -0.3, 0.3), jnp.float32(0.5)])
+    return or_rough([pose(x + 0.75, clearance + 0.25)], [AWAY], goal, k_rough, t)
+
+
+def jump(key, t):
+    """A gap of 0.1 to 1.0 m between platforms over a floor 1 m below; the goal is behind it."""
+    k_x, k_gx, k_gy, k_rough = jax.random.split(key, 4)
+    x, width = uniform(k_x, 1.0, 1.5), between(t, 0.1, 1.0)
+    goal = jnp.stack([x + width + uniform(k_gx, 1.0, 1.5), uniform(k_gy, -0.3, 0.3), jnp.float32(0.5)])
+    closed = [(0.0, 0.0, -0.5, 0.0), (3.0, 0.0, -0.5, 0.0)]
+    return or_rough([pose(x - 1.5, -0.5), pose(x + width + 1.5, -0.5)], closed, goal, k_rough, t)
+
+
+def walk(key, t):
+    """Stairs (60%) and ramps (20%), up or down, or planks of random height (20%)."""
+    k_x, k_kind, k_up, k_top, k_y = jax.random.split(key, 5)
+    x, share, up = uniform(k_x, 1.0, 1.5), uniform(k_kind, 0.0, 1.0), uniform(k_up, 0.0, 1.0) < 0.5
+    kind = (share >= 0.6).astype(int) + (share >= 0.8)  # stairs, ramp, planks
+    number, away = jnp.arange(STEPS), jnp.array([AWAY])
+    landing_z, long = LANDING.half[2], LANDING.half[0]
+
+    def planks(tops):
+        middle = x + TREAD * number + TREAD / 2
+        return jnp.stack([middle, 0 * middle, tops - PLANKS[0].half[2], 0 * middle], -1)
+
+    def landing(top, ahead):
+        return pose(jnp.where(up, x + ahead + long, x - long), top - landing_z)[None]
+
+    rise, angle = between(t, 0.05, 0.25), between(t, 0.0, 0.45)
+    tops = rise * jnp.where(up, number + 1, STEPS - 1 - number)
+    stairs = jnp.concatenate([planks(tops), away, landing(STEPS * rise, STEPS * TREAD)])
+    reach, height = SLOPE_LENGTH * jnp.cos(angle), SLOPE_LENGTH * jnp.sin(angle)
+    tilt = jnp.where(up, -angle, angle)
+    thick = RAMP.half[2]
+    slope = pose(x + reach / 2 - thick * jnp.sin(tilt), height / 2 - thick * jnp.cos(angle), tilt)[None]
+    ramp = jnp.concatenate([jnp.tile(away, (STEPS, 1)), slope, landing(height, reach)])
+    uneven = planks(uniform(k_top, 0.0, 1.0, (STEPS,)) * between(t, 0.05, 0.25))
+    rough = jnp.concatenate([uneven, away, away])
+
+    ahead = jnp.stack([STEPS * TREAD, reach, STEPS * TREAD])[kind]
+    top = jnp.where(up, jnp.stack([STEPS * rise, height, 0.0]), 0.0)[kind]
+    goal = jnp.stack([x + ahead + 1.0, uniform(k_y, -0.3, 0.3), top + 0.5])
+    return jnp.stack([stairs, ramp, rough])[kind], goal
+
+
+@dataclass(frozen=True)
+class Skill:
+    """Slabs of a scene, where a level puts them, and the height of the floor below."""
+
+    slabs: tuple[Slab, ...]
+    draw: Callable  # (key, t) -> poses, goal
+    floor: float = 0.0  # [m]
+
+
+SKILLS = {
+    "walk": Skill((*PLANKS, RAMP, LANDING), walk),
+    "climb_up": Skill((BLOCK, *TILES), climb_up),
+    "climb_down": Skill((BLOCK, *TILES), climb_down),
+    "crouch": Skill((TABLE, *TILES), crouch),
+    "jump": Skill((NEAR, FAR, *TILES), jump, floor=-1.0),
+}
