@@ -450,11 +450,11 @@ def pretrain(args):
     opt = optax.adam(optax.cosine_decay_schedule(args.lr, args.epochs * max(count // args.batch, 1)))
     step, carry = make_step(args, env, net, opt), (variables, opt.init(variables["params"]))
 
-    rows = train(args, env, net, dataset, order, step, carry, out)
+    rows = run_epochs(args, env, net, dataset, order, step, carry, out)
     report(args, env, net, dataset, rows, out)
 
 
-def train(args, env, net, dataset, order, step, carry, out):
+def run_epochs(args, env, net, dataset, order, step, carry, out):
     """All epochs; keeps the weights with the least error on (at most 50,000) validation transitions. Returns rows."""
     few = np.sort(np.random.default_rng(args.seed).permutation(dataset.validation)[:50_000])
     rows, start, best = [], time.perf_counter(), np.inf

@@ -101,7 +101,7 @@ def slab_scene(robot, slabs, floor=0.0, visual=False):
         )
     if visual:  # from outside of the slabs
         camera = spec.camera("track")
-        camera.pos, camera.alt.xyaxes = [-1.0, -4.0, 1.8], [0.97, -0.24, 0, 0.09, 0.35, 0.93]
+        camera.pos, camera.alt.xyaxes = [0.6, -4.0, 1.8], [1, 0, 0, 0, 0.39, 0.92]
     return spec
 
 

@@ -71,8 +71,10 @@ class Clockwork:
 class FiveTimes:
     """A 'network' whose value is obs and whose action is 0."""
 
-    def apply(self, params, obs, method=None):
-        value = obs[..., 0]
+    reads = ("obs",)
+
+    def apply(self, params, inputs, method=None):
+        value = inputs["obs"][..., 0]
         return value if method is not None else (jnp.zeros((*value.shape, 1)), jnp.zeros(1), value)
 
     def value(self):
@@ -91,6 +93,8 @@ def test_time_out_bootstraps_and_termination_does_not(bootstraps):
         | {
             "obs": jnp.array([[0.0], [1.0], [2.0]]),
             "final_obs": jnp.zeros((3, 1)),
+            "history": {},
+            "final_history": {},
             "reward": three,
             "terminated": three > 0,
             "truncated": three > 0,
@@ -111,13 +115,13 @@ class Fixed:
     def __init__(self, mean, log_std, value):
         self.out = jnp.asarray(mean), jnp.asarray(log_std), jnp.asarray(value)
 
-    def apply(self, params, obs):
+    def apply(self, params, inputs):
         return self.out
 
 
 def batch(**fields):
     zeros = jnp.zeros(2)
-    base = dict(obs=zeros, action=jnp.zeros((2, 1)), mean=jnp.zeros((2, 1)), log_prob=zeros, value=zeros)
+    base = dict(inputs={"obs": zeros}, action=jnp.zeros((2, 1)), mean=jnp.zeros((2, 1)), log_prob=zeros, value=zeros)
     return script.Rollout(**base | dict(reward=zeros, bootstrap=zeros, done=zeros) | fields)
 
 
@@ -192,7 +196,7 @@ def test_gradients_are_clipped_apart():
 def test_mirror_loss_of_an_equivariant_policy_is_zero(jitted):
     """A policy that commands mirrored actions for mirrored observations pays nothing; a lopsided one does."""
     env = jitted("anymal_loco").env
-    obs = jax.random.normal(jax.random.key(0), (16, env.obs_dim))
+    inputs = {"obs": jax.random.normal(jax.random.key(0), (16, env.obs_dim))}
 
     class Policy:
         mean = None
@@ -200,14 +204,14 @@ def test_mirror_loss_of_an_equivariant_policy_is_zero(jitted):
         def __init__(self, lean):
             self.lean = lean
 
-        def apply(self, params, obs, method):
-            return jnp.tanh(obs[:, 12:24]) + self.lean  # joint positions map onto actions joint by joint
+        def apply(self, params, inputs, method):
+            return jnp.tanh(inputs["obs"][:, 12:24]) + self.lean  # joint positions map onto actions joint by joint
 
     losses = []
     for lean in (0.0, 0.1):
         policy = Policy(lean)
-        mean = policy.apply({}, obs, None)
-        losses.append([float(script.mirror_loss(env, policy, {}, obs, mean, jax.random.key(k))) for k in range(6)])
+        mean = policy.apply({}, inputs, None)
+        losses.append([float(script.mirror_loss(env, policy, {}, inputs, mean, jax.random.key(k))) for k in range(6)])
     assert max(losses[0]) < 1e-12 < 1e-4 < min(losses[1])
 
 
@@ -216,7 +220,7 @@ def test_update_visits_every_sample_once_an_epoch(monkeypatch):
     args = dataclasses.replace(ARGS, num_epochs=3, mirror_coef=0.0)
 
     def counting(args, net, params, log_std_old, roll, advantage, ret):
-        seen = jax.nn.one_hot(roll.obs, 12).sum(0)
+        seen = jax.nn.one_hot(roll.inputs["obs"], 12).sum(0)
         return 0.0 * params["params"]["actor"], None, {"kl": jnp.float32(0), "seen": seen}
 
     monkeypatch.setattr(script, "ppo_loss", counting)

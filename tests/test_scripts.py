@@ -54,7 +54,7 @@ def test_run_folder(trained):
     assert [float(row["env_steps"]) for row in rows] == [32, 64]
     assert {f"reward/{term}" for term in envs.TASKS["g1_loco"][1].weights} <= set(rows[0])
     assert (out / "curve.png").stat().st_size > 5000
-    params, meta = records.load(out / "policy.msgpack")
+    params, meta = records.load(out / "policy.msgpack", "policy")
     assert meta["task"] == "g1_loco"
     jax.tree.map(np.testing.assert_array_equal, params, jax.device_get(state.params))
     assert not list(out.glob("*.tmp"))
@@ -88,7 +88,7 @@ def test_first_actions_are_small(jitted):
     args = script.merge(SMOKE, env.config.ppo)
     net = script.ActorCritic(args.hidden, env.action_dim, args.init_std)
     state = script.init_state(args, env, net, script.optax.scale_by_adam())
-    assert np.abs(net.apply(state.params, state.env.obs, method=net.mean)).max() < 0.1
+    assert np.abs(net.apply(state.params, {"obs": state.env.obs}, method=net.mean)).max() < 0.1
 
 
 def test_first_clocks_are_spread(jitted):
@@ -176,5 +176,5 @@ def test_interrupt_keeps_the_files(tmp_path):
     assert process.returncode == 0 and "interrupted" in out and "Traceback" not in err, err
     rows = list(csv.DictReader((tmp_path / "metrics.csv").open()))
     assert rows and all(None not in row.values() for row in rows)
-    records.load(tmp_path / "policy.msgpack")
+    records.load(tmp_path / "policy.msgpack", "policy")
     assert (tmp_path / "curve.png").exists()

@@ -1,0 +1,61 @@
+"""Picture of every parkour skill at levels 0, 4 and 9: the robot at the start, its height and ceiling scans as dots.
+
+    python results/courses.py
+
+Writes results/courses.png.
+"""
+
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from PIL import Image, ImageDraw
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(ROOT))
+
+import envs
+from envs import parkour, render, terrain
+
+LEVELS = (0, 4, 9)
+
+
+def dots(spec, points, rgba):
+    """Small spheres at points (P, 3)."""
+    for point in np.asarray(points, np.float64):
+        spec.worldbody.add_site(pos=point, size=[0.015, 0.015, 0.015], rgba=rgba)
+
+
+def picture(env, level, key):
+    """The start of one episode of a level, with what the robot's noise-free scans see. Returns an Image."""
+    state = env.reset(key, curriculum=env.at_level(level))
+    motion, task = env.motion(state.physics), state.task.replace(shift=jnp.zeros(3))
+    spec = render.build(env, state.physics)
+    xy = env.grid(parkour.HEIGHT_GRID, motion, task)
+    ground = env.heights(motion.mocap_pos, motion.mocap_quat, xy)
+    dots(spec, jnp.concatenate([xy, ground[:, None]], -1), [0.9, 0.2, 0.1, 1])
+    if env.overhead.any():
+        xy = env.grid(parkour.CEILING_GRID, motion, task)
+        under = terrain.underside_heights(motion.mocap_pos[env.overhead], env.half[env.overhead], xy)
+        seen = np.asarray(under - motion.base_pos[2] < 1.0)
+        dots(spec, jnp.concatenate([xy, under[:, None]], -1)[seen], [0.1, 0.3, 0.9, 1])
+    return render.draw(spec, np.asarray(state.physics.qpos, np.float64)[None])[0]
+
+
+def main():
+    tasks = [task for task, (family, _) in envs.TASKS.items() if family is parkour.Parkour]
+    sheet = Image.new("RGB", (render.WIDTH * len(LEVELS), render.HEIGHT * len(tasks)), "white")
+    for row, task in enumerate(tasks):
+        env = envs.make(task, "c", noise=0.0)
+        for column, level in enumerate(LEVELS):
+            image = picture(env, level, jax.random.key(3))
+            ImageDraw.Draw(image).text((6, 4), f"{task}, level {level}", fill=(20, 20, 20))
+            sheet.paste(image, (column * render.WIDTH, row * render.HEIGHT))
+    sheet.save(ROOT / "results/courses.png", optimize=True)
+    print("wrote results/courses.png")
+
+
+if __name__ == "__main__":
+    main()
