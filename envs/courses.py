@@ -41,7 +41,7 @@ def between(t, easy, hard):
 def tiles(key, t):
     """Twelve tiles (12, 4) of random height about the way ahead."""
     k_x, k_y, k_z = jax.random.split(key, 3)
-    x, y = uniform(k_x, 0.7, 3.5, (12,)), uniform(k_y, -0.8, 0.8, (12,))
+    x, y = uniform(k_x, 0.9, 3.5, (12,)), uniform(k_y, -0.8, 0.8, (12,))
     top = uniform(k_z, 0.0, between(t, 0.02, 0.08), (12,))
     return jnp.stack([x, y, top - TILES[0].half[2], jnp.zeros(12)], -1)
 

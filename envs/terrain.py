@@ -123,7 +123,7 @@ def top_heights(pos, quat, half, xy, floor):
 
 def underside_heights(pos, half, xy):
     """Height [m] of the lowest ceiling slab over xy (..., 2), infinite where there is none; pos and half (M, 3)."""
-    inside = jnp.all(jnp.abs(xy[..., None, :] - pos[:, :2]) <= half[:, :2], -1)
+    inside = jnp.all(jnp.abs(xy[..., None, :] - pos[:, :2]) <= half[:, :2], -1) & (pos[:, 2] > PARKED / 2)
     return jnp.min(jnp.where(inside, pos[:, 2] - half[:, 2], jnp.inf), -1, initial=jnp.inf)
 
 

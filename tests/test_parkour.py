@@ -1,0 +1,399 @@
+"""Pedipulation and the parkour skills: courses against mj_ray, spawns, levels, scans, mirrors, rewards, endings."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+import envs
+from envs import courses, parkour
+
+SKILLS = {
+    "anymal_parkour_walk": "walk",
+    "anymal_climb_up": "climb_up",
+    "anymal_climb_down": "climb_down",
+    "anymal_crouch": "crouch",
+    "anymal_jump": "jump",
+}
+N = 30  # episodes, three of each level
+
+
+def at_levels(env):
+    """N episode starts, level i % 10."""
+    reset = jax.jit(jax.vmap(lambda key, level: env.reset(key, curriculum=env.at_level(level))))
+    return reset(jax.random.split(jax.random.key(0), N), jnp.arange(N) % 10)
+
+
+@pytest.fixture(scope="module")
+def started(jitted):
+    """task -> environment and its N starts, made once."""
+    cache = {}
+
+    def get(task):
+        if task not in cache:
+            env = jitted(task).env
+            cache[task] = env, at_levels(env)
+        return cache[task]
+
+    return get
+
+
+def simulation(env, state, i):
+    """MjData of one start, everything computed."""
+    data = mujoco.MjData(env.model)
+    data.qpos[:] = np.asarray(state.physics.qpos[i], np.float64)
+    data.mocap_pos[:], data.mocap_quat[:] = (
+        np.asarray(x[i]) for x in (state.physics.mocap_pos, state.physics.mocap_quat)
+    )
+    mujoco.mj_forward(env.model, data)
+    return data
+
+
+def ray(env, data, start, direction):
+    """Distance from start to the first geom of the scene along a direction, the robot out of the way."""
+    geom = np.zeros(1, np.int32)
+    return mujoco.mj_ray(env.model, data, np.asarray(start, np.float64), np.array([0, 0, direction]), None, 1, -1, geom)
+
+
+@pytest.mark.parametrize("task", SKILLS)
+def test_scans_are_what_rays_meet(task, started):
+    """Ground under and ceiling over 100 random points of each start, ramps and stairs included."""
+    env, state = started(task)
+    heights = jax.jit(env.heights)
+    rng = np.random.default_rng(0)
+    for i in range(N):
+        data = simulation(env, state, i)
+        data.qpos[0] = 100.0
+        mujoco.mj_kinematics(env.model, data)
+        xy = rng.uniform([-1.5, -1.9], [5.5, 1.9], (100, 2))
+        where = state.physics.mocap_pos[i], state.physics.mocap_quat[i]
+        table = data.mocap_pos[env.overhead]
+        from_z = 5.0 if not len(table) or table[0, 2] < 0 else table[0, 2] - 0.26
+        found = [from_z - ray(env, data, [*point, from_z], -1.0) for point in xy]
+        np.testing.assert_allclose(heights(*where, jnp.asarray(xy)), found, atol=2e-3)
+        if env.overhead.any():
+            half = env.half[env.overhead]
+            under = parkour.terrain.underside_heights(where[0][env.overhead], half, jnp.asarray(xy))
+            for point, height in zip(xy, np.asarray(under), strict=True):
+                up = ray(env, data, [*point, 0.3], 1.0)
+                assert (up < 0 and np.isinf(height)) or abs(0.3 + up - height) < 2e-3
+
+
+@pytest.mark.parametrize("task", SKILLS)
+def test_robots_start_on_the_ground_and_inside_nothing(task, started):
+    env, state = started(task)
+    for i in range(N):
+        data = simulation(env, state, i)
+        feet = np.array([data.site(foot).xpos for foot in env.robot.feet])
+        where = state.physics.mocap_pos[i], state.physics.mocap_quat[i]
+        gap = feet[:, 2] - env.robot.sole - np.asarray(env.heights(*where, jnp.asarray(feet[:, :2])))
+        assert np.abs(gap).max() < 0.01
+        assert min((contact.dist for contact in data.contact[: data.ncon]), default=0.0) > -1e-3
+
+
+def slab(name, skill, poses):
+    names = [slab.name for slab in courses.SKILLS[skill].slabs]
+    return np.asarray(poses)[:, names.index(name)]
+
+
+@pytest.mark.parametrize("level", range(10))
+def test_levels_are_what_the_table_says(level):
+    """Box height, clearance, gap and stair rise of a level; a fifth of the episodes have rough tiles instead."""
+    t = level / 9
+    keys = jax.random.split(jax.random.key(level), 300)
+    draw = {skill: jax.vmap(lambda k, s=skill: courses.SKILLS[s].draw(k, t))(keys) for skill in courses.SKILLS}
+    for skill, height in (("climb_up", 0.1 + 0.9 * t), ("climb_down", 0.1 + 0.9 * t)):
+        block = slab("block", skill, draw[skill][0])
+        used = block[:, 2] > -10
+        assert 0.7 < used.mean() < 0.9
+        np.testing.assert_allclose(block[used, 2] + 1.0, height, atol=1e-5)
+    table = slab("table", "crouch", draw["crouch"][0])
+    table = table[table[:, 2] > -10]
+    np.testing.assert_allclose(table[:, 2] - 0.25, 0.9 - 0.5 * t, atol=1e-5)
+    near, far = (slab(name, "jump", draw["jump"][0]) for name in ("near_platform", "far_platform"))
+    gap = far[:, 0] - near[:, 0] - 3.0
+    np.testing.assert_allclose(np.unique(gap.round(4)), np.unique(np.round([0, 0.1 + 0.9 * t], 4)), atol=1e-3)
+    np.testing.assert_allclose(near[:, 2] + 0.5, 0.0, atol=1e-6)
+    tops = np.stack([slab(f"plank{i}", "walk", draw["walk"][0])[:, 2] for i in range(8)], 1) + 1.2
+    rise = np.diff(tops, axis=1)
+    stairs = (np.ptp(rise, axis=1) < 1e-4) & (tops[:, 0] > -10)
+    assert 0.5 < stairs.mean() < 0.7
+    np.testing.assert_allclose(np.abs(rise[stairs]), 0.05 + 0.2 * t, atol=1e-4)
+    tilt = slab("ramp", "walk", draw["walk"][0])
+    tilt = tilt[tilt[:, 2] > -10, 3]
+    assert 0.1 < len(tilt) / 300 < 0.3
+    np.testing.assert_allclose(np.abs(tilt), 0.45 * t, atol=1e-6)
+
+
+@pytest.mark.parametrize("task", ["anymal_climb_up", "anymal_crouch"])
+def test_height_observation_without_noise(task, jitted):
+    """Value (i, j) is base height - ground - 0.5 at x = -1 + 0.1 i, y = -0.5 + 0.1 j of the heading frame, times 2."""
+    env = jitted(task, noise=0.0, scan_shift=0.0).env
+    state = at_levels(env)
+    start = env.obs_dim - (231 + 66 * bool(env.overhead.any()))
+    for i in range(0, N, 7):
+        data = simulation(env, state, i)
+        base, yaw = data.qpos[:3].copy(), float(env.motion(jax.tree.map(lambda x: x[i], state.physics)).yaw)
+        data.qpos[0] = 100.0
+        mujoco.mj_kinematics(env.model, data)
+        for row, column in ((0, 0), (20, 0), (20, 10), (10, 5), (13, 2)):
+            x, y = -1 + 0.1 * row, -0.5 + 0.1 * column
+            at = base[0] + np.cos(yaw) * x - np.sin(yaw) * y, base[1] + np.sin(yaw) * x + np.cos(yaw) * y
+            from_z = 0.35 if env.overhead.any() else 5.0
+            ground = from_z - ray(env, data, [*at, from_z], -1.0)
+            want = 2 * np.clip(base[2] - ground - 0.5, -1, 1)
+            assert state.obs[i, start + 11 * row + column] == pytest.approx(want, abs=5e-3)
+
+
+def mirrored_start(env, mirror, state):
+    """The same episodes with robot, slabs and goal reflected."""
+    polar = jnp.array({"left_right": [1.0, -1, 1], "front_back": [-1.0, 1, 1]}[mirror])
+    axial = -polar
+    perm, sign = env.robot.mirror_joints(mirror)
+    p = state.physics
+    quat = jnp.concatenate([jnp.ones(1), axial])  # a turn's axis is axial
+    other = p.replace(
+        qpos=jnp.concatenate([p.qpos[:, :3] * polar, p.qpos[:, 3:7] * quat, p.qpos[:, 7:][:, perm] * sign], 1),
+        qvel=jnp.concatenate([p.qvel[:, :3] * polar, p.qvel[:, 3:6] * axial, p.qvel[:, 6:][:, perm] * sign], 1),
+        mocap_pos=p.mocap_pos * polar,
+        mocap_quat=p.mocap_quat * quat,
+    )
+    return state.replace(
+        physics=other, task=state.task.replace(goal=state.task.goal * polar, goal_yaw=-state.task.goal_yaw)
+    )
+
+
+@pytest.mark.parametrize("task", SKILLS)
+def test_mirrored_scene_gives_mirrored_observation_and_motion(task, jitted):
+    """Reflect robot, slabs and goal; the observation is the mirrored one, and so it stays for ten control steps."""
+    exact = jitted(task, noise=0.0, scan_shift=0.0, push_velocity=0.0, added_mass=(0.0, 0.0))
+    env, start = exact.env, at_levels(exact.env)
+    for mirror in env.mirrors:
+        compare_mirrored(exact, mirror, start, mirrored_start(env, mirror, start))
+
+
+def compare_mirrored(exact, mirror, state, twin):
+    """Step both with mirrored actions; nine in ten robots must stay each other's image."""
+    for i in range(10):
+        action = 0.3 * jax.random.normal(jax.random.key(i), (N, 12))
+        state, twin = exact.step(state, action), exact.step(twin, exact.env.mirror(mirror, "action", action))
+        alive = ~np.asarray(state.terminated | twin.terminated | state.truncated)
+        want = np.asarray(exact.env.mirror(mirror, "obs", state.final_obs))
+        close = np.abs(np.asarray(twin.final_obs) - want)[:, :51].max(1) < 2e-2  # scans jump at edges
+        assert close[alive].mean() > 0.9, i
+
+
+@pytest.fixture(scope="module")
+def climb_up(jitted):
+    """anymal_climb_up and one start."""
+    env = jitted("anymal_climb_up").env
+    return env, jax.jit(env.reset)(jax.random.key(0))
+
+
+def rule(env, state, level, distance, far, terminated, best=0):
+    """The next curriculum of an environment at a level whose episode ends at a distance."""
+    task = state.task.replace(level=jnp.int32(level), best=jnp.int32(best), far=jnp.float32(far))
+    motion = env.motion(state.physics)
+    goal = motion.base_pos + jnp.array([distance, 0.0, 0.0])
+    ended = jnp.asarray(terminated)
+    after = env.graduate(jax.random.key(1), task.replace(goal=goal), motion, ended, ~ended)
+    return int(after["level"]), int(after["best"])
+
+
+def test_promotion_and_demotion(climb_up):
+    env, state = climb_up
+    assert rule(env, state, 3, 0.3, 2.0, False) == (4, 4)  # there in time
+    assert rule(env, state, 3, 0.8, 2.0, False) == (3, 3)  # over half way
+    assert rule(env, state, 3, 1.2, 2.0, False, best=7) == (2, 7)  # not half way; the best stays
+    assert rule(env, state, 3, 0.3, 2.0, True)[0] == 2  # fell, although there
+    assert rule(env, state, 0, 1.9, 2.0, False) == (0, 0)
+    level, best = rule(env, state, 9, 0.1, 2.0, False, best=9)
+    assert 0 <= level <= 9 and best == 9
+
+
+def test_fixed_level_stays():
+    env = envs.make("anymal_climb_up", "c", level=6)
+    state = jax.jit(env.reset)(jax.random.key(0))
+    assert int(state.task.level) == 6 and rule(env, state, 6, 0.1, 2.0, False)[0] == 6
+
+
+def test_level_survives_the_reset_and_moves_the_box(jitted):
+    """An environment that ends its episode in failure starts again one level lower, its box lower too."""
+    env = jitted("anymal_climb_up").env
+    state = jax.jit(lambda k: env.reset(k, curriculum=env.at_level(5)))(jax.random.key(3))
+    upside_down = state.physics.qpos.at[3:7].set(jnp.array([0.0, 1, 0, 0])).at[2].set(1.5)
+    state = state.replace(physics=state.physics.replace(qpos=upside_down))
+    after = jax.jit(env.step)(state, jnp.zeros(12))
+    assert bool(after.terminated) and int(after.task.level) == 4 and int(after.task.best) == 5
+    tops = [float(after.physics.mocap_pos[0, 2]) + 1.0]
+    assert tops[0] == pytest.approx(0.1 + 0.9 * 4 / 9, abs=1e-4) or tops[0] < -40  # a box, or rough tiles
+
+
+def test_time_limit_is_an_end_without_bootstrap():
+    env = envs.make("anymal_climb_up", "c")
+    assert not env.bootstrap_time_outs and env.episode_steps == 300
+    clocks = jax.vmap(lambda k: env.reset(k).clock)(jax.random.split(jax.random.key(0), 200))
+    assert 0 <= clocks.min() < 10 and 90 < clocks.max() <= 100  # 4 to 6 s
+
+
+def test_falling_into_the_pit_ends_a_jump(jitted):
+    env = jitted("anymal_jump").env
+    state = jax.jit(env.reset)(jax.random.key(0))
+    low = state.replace(physics=state.physics.replace(qpos=state.physics.qpos.at[2].set(-0.4).at[0].set(-5.0)))
+    assert bool(jax.jit(env.step)(low, jnp.zeros(12)).terminated)
+    assert not bool(jax.jit(env.step)(state, jnp.zeros(12)).terminated)
+
+
+def test_foot_force_and_base_contact_end_an_episode(jitted):
+    env = jitted("anymal_climb_down").env
+    state = jax.jit(env.reset)(jax.random.key(0))
+    motion = env.motion(state.physics)
+
+    def ends(**forces):
+        return bool(env.failed(state.task, motion.replace(**forces)))
+
+    foot = jnp.zeros((4, 3)).at[2, 2]
+    sensors = motion.sensors.at[env.ends[0]]
+    assert not ends(foot_force=foot.set(990.0)) and ends(foot_force=foot.set(1010.0))
+    assert not ends(sensors=sensors.set(0.5)) and ends(sensors=sensors.set(2.0))
+
+
+def test_parkour_rewards_by_hand(climb_up):
+    """Each term on a motion whose numbers are chosen so that the answer is plain."""
+    env, state = climb_up
+    motion, zero = env.motion(state.physics), jnp.zeros(12)
+    motion = motion.replace(
+        base_pos=jnp.zeros(3),
+        quat=jnp.array([1.0, 0, 0, 0]),
+        yaw=jnp.float32(0),
+        lin_vel=jnp.array([1.0, 0, 0]),
+        joint_pos=zero,
+        joint_vel=zero.at[0].set(9.0).at[1].set(20.0),
+        torque=zero.at[3].set(2.0),
+        base_acc=jnp.array([3.0, 4.0, 0, 10.0, 0, 0]),
+        foot_force=jnp.array([[0.0, 0, 800], [30.0, 0, 10], [0, 0, 0], [0, 0, 5000]]),
+    )
+    task = state.task.replace(
+        goal=jnp.array([2.0, 0, 0]),
+        goal_yaw=jnp.float32(0.4),
+        foot_acc=jnp.zeros((4, 3)).at[0, 0].set(30.0).at[1, 2].set(900.0),
+    )
+    got = env.rewards(task, motion, zero.at[5].set(0.5), zero, 280)
+    want = {
+        "position": 0.0,  # 1 - 0.5 * 2
+        "heading": 0.0,  # too far
+        "direction": 2.0 / (2.0 + 0.1),
+        "wait": 0.0,
+        "stand": 0.0,
+        "joint_vel": 81.0 + 400.0,
+        "torque": 4.0,
+        "joint_vel_limit": 0.5 + 1.0,
+        "base_acc": 25.0 + 0.02 * 100.0,
+        "feet_acc": 30.0 + 100.0,
+        "action_rate": 0.25,
+        "feet_force": 100.0**2 + 700.0**2,
+        "stumble": 1.0,
+    }
+    for name, value in want.items():
+        assert float(got[name]) == pytest.approx(value, rel=1e-4, abs=1e-5), name
+    near = task.replace(goal=jnp.array([0.2, 0, 0]))
+    bent = motion.replace(joint_pos=zero.at[0].set(3.0).at[1].set(4.0), lin_vel=jnp.zeros(3))
+    got = env.rewards(near, bent, zero, zero, 280)
+    assert float(got["position"]) == pytest.approx(0.9) and float(got["heading"]) == pytest.approx(0.8)
+    assert float(got["stand"]) == pytest.approx(5.0) and float(got["wait"]) == 0.0
+    early = env.rewards(task.replace(goal=jnp.array([0.4, 0, 0])), bent, zero, zero, 100)
+    assert float(early["position"]) == 0.0 and float(early["wait"]) == 1.0
+    assert set(env.config.weights) == set(got)
+
+
+@pytest.mark.parametrize("level", [-1, 10])
+def test_levels_that_do_not_exist_are_refused(level):
+    with pytest.raises(ValueError, match=f"level {level} does not exist; choose 0 to 9"):
+        envs.make("anymal_jump", "c", level=level)
+
+
+def test_unknown_skill_is_refused():
+    with pytest.raises(ValueError, match="unknown skill 'fly'; choose one of walk"):
+        envs.make("anymal_jump", "c", skill="fly")
+
+
+# --- pedipulation ---
+
+
+def test_pedipulation_target_and_error(jitted):
+    """The observed point is R^T (p - base), and the error the distance of the right front foot."""
+    task = jitted("anymal_pedipulation", noise=0.0)
+    env, state = task.env, task.start(8)
+    for i in range(20):
+        state = task.act(state, i)
+    p = jax.device_get(state.physics)
+    for n in range(8):
+        data = mujoco.MjData(env.model)
+        data.qpos[:] = p.qpos[n]
+        mujoco.mj_forward(env.model, data)
+        point = np.asarray(state.task.point[n])
+        np.testing.assert_allclose(
+            state.obs[n, -3:], data.body("base").xmat.reshape(3, 3).T @ (point - p.qpos[n, :3]), atol=1e-4
+        )
+        if not state.terminated[n]:
+            distance = np.linalg.norm(data.site("RF_foot").xpos - point)
+            assert float(state.metrics["foot_error"][n]) == pytest.approx(distance, abs=0.02)  # a push may follow
+
+
+def test_pedipulation_points_fill_the_box_and_change_after_six_seconds(jitted):
+    task = jitted("anymal_pedipulation", noise=0.0)
+    points = np.asarray(jax.vmap(lambda k: task.env.draw_point(k, 0.0))(jax.random.split(jax.random.key(0), 400)))
+    for axis, (low, high) in enumerate(task.env.config.box):
+        assert low <= points[:, axis].min() < low + 0.05 and high - 0.05 < points[:, axis].max() <= high
+    assert task.env.command_steps == 300 and task.env.episode_steps == 600
+    state = task.start(8)
+    late = state.replace(clock=jnp.full(8, 299))
+    assert not np.allclose(task.hold(late).task.point, state.task.point)
+    assert np.allclose(task.hold(state).task.point, state.task.point)
+
+
+def test_pedipulation_rewards_by_hand(jitted):
+    env = jitted("anymal_pedipulation").env
+    state = jax.jit(env.reset)(jax.random.key(0))
+    zero = jnp.zeros(12)
+    motion = env.motion(state.physics)
+    feet = jnp.zeros((4, 3)).at[1].set(jnp.array([0.3, 0.0, 0.4]))
+    motion = motion.replace(
+        foot_pos=feet,
+        torque=zero.at[0].set(3.0),
+        joint_acc=zero.at[1].set(5.0),
+        joint_vel=zero.at[2].set(2.0),
+        sensors=jnp.zeros_like(motion.sensors).at[env.bodies[0, 2]].set(4.0).at[env.bodies[-1, 0]].set(2.0),
+    )
+    got = env.rewards(state.task.replace(point=jnp.zeros(3)), motion, zero.at[0].set(0.5), zero, 0)
+    want = {"torque": 9.0, "joint_acc": 25.0, "joint_vel": 4.0, "action_rate": 0.25, "collision": 2.0}
+    want["foot_tracking"] = np.exp(-0.5 / 0.8)
+    assert {name: float(value) for name, value in got.items()} == pytest.approx(want, rel=1e-5)
+
+
+def test_pedipulation_has_no_mirror(jitted):
+    assert jitted("anymal_pedipulation").env.mirrors == {}
+
+
+def test_pedipulation_curriculum_grows_only_when_asked(jitted):
+    plain = jitted("anymal_pedipulation").env
+    state = jax.jit(plain.reset)(jax.random.key(0))
+    good = state.task.replace(error_sum=jnp.float32(0.5), steps=jnp.float32(10.0))
+    yes, no = jnp.asarray(True), jnp.asarray(False)
+    motion = plain.motion(state.physics)
+    growing = envs.make("anymal_pedipulation", "c", curriculum=True)
+    assert float(plain.graduate(None, good, motion, no, yes)["difficulty"]) == 0.0
+    assert float(growing.graduate(None, good, motion, no, yes)["difficulty"]) == 1.0
+    assert float(growing.graduate(None, good, motion, yes, no)["difficulty"]) == 0.0
+    far = jax.vmap(lambda k: growing.draw_point(k, 10.0))(jax.random.split(jax.random.key(0), 300))
+    assert far[:, 0].max() > 2.0 and far[:, 1].min() < -1.0
+
+
+def test_same_observation_layout_across_skills():
+    """A policy of one skill is refused where the observation differs (crouch sees a ceiling)."""
+    sizes = {task: envs.make(task, "c").obs_dim for task in SKILLS}
+    assert sizes.pop("anymal_crouch") == 348 and set(sizes.values()) == {282}
+    assert {field.name for field in dataclasses.fields(parkour.ParkourConfig)} >= {"level", "skill"}
