@@ -231,7 +231,7 @@ class PIDMActorCritic(nn.Module):
 
     def setup(self):
         ends = {"goal": "intention_encoder", "goal_to_head": True}
-        self.actor = PIDM(self.sizes, self.action_dim, head="action_synthesizer", gain=0.01, **ends)
+        self.actor = PIDM(self.sizes, self.action_dim, head="action_synthesizer", gain=0.003, **ends)  # actions ~0
         self.critic = PIDM(self.sizes, 1, head="value_synthesizer", gain=0.05, **ends)
         self.log_std = self.param("log_std", nn.initializers.constant(jnp.log(self.init_std)), (self.action_dim,))
         for name, width in (("prop", self.prop_dim), ("action", self.action_dim)):
@@ -259,7 +259,10 @@ def make_net(args, env):
     """The network that the arguments name, for this environment."""
     if args.network == "mlp":
         return ActorCritic(args.hidden, env.action_dim, args.init_std)
-    return PIDMActorCritic(SIZES[env.robot.name], env.prop_dim, env.action_dim, args.init_std)
+    sizes = SIZES[env.robot.name]
+    wide = env.config.ppo.get("intention", sizes.goal[:-1])  # perceptive tasks need more to see with
+    sizes = dataclasses.replace(sizes, goal=(*wide, sizes.goal[-1]))
+    return PIDMActorCritic(sizes, env.prop_dim, env.action_dim, args.init_std)
 
 
 # --- Warm start ---

@@ -290,6 +290,7 @@ def parkour(skill, weights=(), **changes):
         "weights": WEIGHTS | dict(weights),
         "ppo": {
             "hidden": (512, 256, 128),
+            "intention": (512, 256),  # of the PIDM's intention encoder, before its last layer
             "entropy": 0.005,
             "init_std": 0.6,
             "cpu": {"num_envs": 512, "num_steps": 48, "total_steps": 12_000_000},

@@ -35,6 +35,10 @@ def test_unreached_levels_are_said():
     assert report.against_random([np.nan, 3.0], [2.0, 2.0], False) == "not reached by 1 of 2"
 
 
+def test_the_page_of_the_study_is_what_its_runs_give():
+    report.main(report.Args(check=True))
+
+
 @pytest.fixture
 def study(tmp_path, monkeypatch):
     """Two methods of one seed each."""
