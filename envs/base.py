@@ -299,7 +299,7 @@ class Env:
         key, k_sense, k_task, k_push, k_grade, k_reset = jax.random.split(state.key, 6)
         physics = self.engine.step(state.physics, self.default_pose + self.robot.action_scale * action)
         healthy = jnp.all(jnp.abs(physics.qpos) < BLOWN_UP) & jnp.all(jnp.abs(physics.qvel) < BLOWN_UP)  # false for NaN
-        physics = select(healthy, physics, state.physics)  # a diverged robot must not poison the batch
+        physics = select(healthy, physics, self.standing(state.physics))  # a diverged robot must not poison the batch
 
         # rewards and termination, on the true state
         motion = self.motion(physics)
@@ -373,6 +373,13 @@ class Env:
         mass_scale = uniform(k_link, *c.link_mass, (m.nbody,)).at[base].add(added / m.body_mass[base])
         physics = self.engine.initial(qpos, qvel, uniform(k_friction, *c.friction), mass_scale)
         return physics.replace(mocap_pos=course.mocap_pos, mocap_quat=course.mocap_quat)
+
+    def standing(self, physics):
+        """The same simulation with the robot still, in its default pose: finite whatever it was before."""
+        m = self.model
+        qpos = jnp.concatenate([jnp.array([0.0, 0, 1, 1, 0, 0, 0]), self.default_pose])
+        fresh = self.engine.initial(qpos, jnp.zeros(m.nv), physics.friction, physics.mass_scale)
+        return fresh.replace(mocap_pos=physics.mocap_pos, mocap_quat=physics.mocap_quat)
 
     def push_interval(self, key):
         """Control steps until the next push."""

@@ -15,6 +15,12 @@ from envs.engine import ENGINES, make_engine
 from envs.robots import ROBOTS
 
 TASKS = list(envs.TASKS)
+LOCOMOTION = ["anymal_loco", "go1_loco", "g1_loco"]  # one a robot; parkour has tests of its own
+
+
+def spawn(env):
+    """key -> Physics at the start of an episode."""
+    return lambda key: env.spawn(key, env.course(key, env.first_curriculum()))
 
 
 def assert_trees_equal(a, b):
@@ -42,10 +48,11 @@ def test_contract(task):
 
 
 def test_observation_widths():
-    assert {task: envs.make(task, "c").obs_dim for task in TASKS} == {"anymal_loco": 48, "go1_loco": 48, "g1_loco": 99}
+    widths = {"anymal_loco": 48, "go1_loco": 48, "g1_loco": 99, "anymal_pedipulation": 48, "anymal_crouch": 348}
+    assert {task: envs.make(task, "c").obs_dim for task in TASKS} == dict.fromkeys(TASKS, 282) | widths
 
 
-@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("task", [*LOCOMOTION, "anymal_climb_up"])
 def test_same_key_same_rollout(jitted, task):
     runs = []
     for _ in range(2):
@@ -57,7 +64,7 @@ def test_same_key_same_rollout(jitted, task):
     assert not np.array_equal(jitted(task).start(4, seed=1).obs, jitted(task).start(4, seed=0).obs)
 
 
-@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("task", [*LOCOMOTION, "anymal_pedipulation"])
 def test_robots_start_on_their_feet(jitted, task):
     """At reset the lowest foot site is `sole` above the ground, by MuJoCo's kinematics; nobody starts inside it."""
     env, state = jitted(task).env, jitted(task).start(16)
@@ -70,7 +77,7 @@ def test_robots_start_on_their_feet(jitted, task):
         assert all(contact.dist > -0.01 for contact in data.contact)
 
 
-@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("task", LOCOMOTION)
 def test_motion_is_what_mujoco_says(jitted, task):
     """Velocities, gravity and feet of Motion against MuJoCo's own sensors and frames, after some steps."""
     env, state = jitted(task).env, jitted(task).start(4)
@@ -219,7 +226,7 @@ def test_pushes(jitted):
 def test_randomised_fields_reach_the_engine(engine):
     """Heavier robots press harder, slippery ones slide, wrenches push: the same on every engine."""
     env = envs.make("go1_loco", engine, noise=0.0, spawn_xy=0.0, spawn_yaw=0.0, added_mass=(0.0, 0.0))
-    one = env.spawn(jax.random.key(0))
+    one = spawn(env)(jax.random.key(0))
     trunk = env.model.body("trunk").id
     batch = jax.tree.map(lambda x: jnp.stack([x] * 4), one)
     batch = batch.replace(
@@ -245,8 +252,8 @@ def test_engines_agree(name):
     paths = {}
     for engine in ("c", "mjx"):
         env = envs.make(task, engine, spawn_velocity=0.0, spawn_joints=(1.0, 1.0))
-        physics = jax.vmap(env.spawn)(jax.random.split(jax.random.key(0), 2))
-        targets = env.default_pose + 0.1 * jax.random.normal(jax.random.key(1), (25, 2, env.action_dim))
+        physics = jax.vmap(spawn(env))(jax.random.split(jax.random.key(0), 2))
+        targets = env.default_pose + 0.05 * jax.random.normal(jax.random.key(1), (25, 2, env.action_dim))
         step = jax.vmap(env.engine.step)
         run = jax.jit(lambda p, t, step=step: jax.lax.scan(lambda p, t: (step(p, t),) * 2, p, t))
         paths[engine] = jax.device_get(run(physics, targets)[1])
@@ -261,7 +268,7 @@ def test_engines_agree(name):
 def test_vmap_twice_is_one_batch(jitted):
     """Seeds x environments through engine c: each seed's numbers are those of a run of its own, bit for bit."""
     env = jitted("go1_loco").env
-    physics = jax.vmap(env.spawn)(jax.random.split(jax.random.key(0), 6))
+    physics = jax.vmap(spawn(env))(jax.random.split(jax.random.key(0), 6))
     targets = env.default_pose + 0.2 * jax.random.normal(jax.random.key(1), (6, 12))
     flat = jax.jit(jax.vmap(env.engine.step))(physics, targets)
     nest = jax.tree.map(lambda x: x.reshape(2, 3, *x.shape[1:]), (physics, targets))
@@ -269,7 +276,7 @@ def test_vmap_twice_is_one_batch(jitted):
     assert_trees_equal(flat, jax.tree.map(lambda x: x.reshape(6, *x.shape[2:]), nested))
 
 
-@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("task", LOCOMOTION)
 def test_mirrored_rollout_is_seen_mirrored(jitted, task):
     """Simulate a robot and its mirror image; observation, x_t and reward of the one map onto those of the other."""
     base = jitted(task, noise=0.0)
@@ -316,7 +323,9 @@ def test_mirrors_are_involutions(jitted, task):
 
 
 def test_wrong_names_are_listed():
-    with pytest.raises(ValueError, match="unknown task 'go2_loco'; choose one of anymal_loco, go1_loco, g1_loco"):
+    with pytest.raises(
+        ValueError, match="unknown task 'go2_loco'; choose one of anymal_loco, go1_loco, g1_loco, anymal_ped"
+    ):
         envs.make("go2_loco")
     with pytest.raises(ValueError, match="unknown engine 'bullet'; choose one of auto, c, mjx"):
         envs.make("go1_loco", "bullet")

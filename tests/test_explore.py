@@ -39,7 +39,7 @@ def test_rough_ground_is_what_a_ray_meets(go1):
     data = mujoco.MjData(go1.model)
     mujoco.mj_forward(go1.model, data)
     xy = np.random.default_rng(0).uniform([5, -10], [25, 10], (500, 2))
-    want = np.asarray(go1.ground_height(jnp.asarray(xy)))
+    want = np.asarray(go1.ground_height(None, jnp.asarray(xy)))
     for point, height in zip(xy, want, strict=True):
         start = np.array([*point, 5.0])
         distance = mujoco.mj_ray(go1.model, data, start, np.array([0.0, 0, -1]), None, 1, -1, np.zeros(1, np.int32))
@@ -59,7 +59,7 @@ def test_robots_start_on_the_ground(robot):
         data.qpos[:] = qpos
         mujoco.mj_forward(env.model, data)
         feet = np.array([data.site(foot).xpos for foot in env.robot.feet])
-        gaps = feet[:, 2] - env.robot.sole - np.asarray(env.ground_height(jnp.asarray(feet[:, :2])))
+        gaps = feet[:, 2] - env.robot.sole - np.asarray(env.ground_height(None, jnp.asarray(feet[:, :2])))
         assert -1e-3 < gaps.min() < 1e-3, gaps
     scales = np.asarray(physics.mass_scale)[:, 2:]
     assert 0.85 <= scales.min() < 0.9 and 1.1 < scales.max() <= 1.15
