@@ -287,15 +287,15 @@ def retrain(args, member, opt, ensemble, buffer, filled, key):
     return ensemble.replace(params=params, opt_state=opt_state, norm=norm), loss.mean()
 
 
-def judge(args, member, ensemble, roll):
-    """Disagreement on a rollout (T, N) and its metrics, before the ensemble has seen that rollout."""
-    flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), roll)
+def judge(member, ensemble, seen):
+    """Disagreement on a rollout's Transitions (T, N) and its metrics, before the ensemble is trained on them."""
+    flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), seen)
     mean, _ = predict(member, ensemble.params, ensemble.norm, flat)
     raw = disagreement(mean)
     scale = jnp.where(ensemble.scale > 0, 0.95 * ensemble.scale + 0.05 * raw.mean(), raw.mean())
     error = jnp.abs(mean.mean(0) - flat.action).mean()  # [action units]
     metrics = {"disagreement": raw.mean(), "ensemble_error": error, "action_size": jnp.abs(flat.action).mean()}
-    return raw.reshape(roll.action.shape[:2]), ensemble.replace(scale=scale), metrics
+    return raw.reshape(seen.action.shape[:2]), ensemble.replace(scale=scale), metrics
 
 
 # --- Rollout ---
@@ -496,7 +496,7 @@ def iteration(args, env, net, opt, member, member_opt, state):
     """One iteration: rollout, disagreement as reward, PPO update, ensemble update. Also returns data (T, N, ...)."""
     keys = jax.random.split(jax.random.fold_in(jax.random.key(args.seed), state.iteration), 3)
     env_state, roll, seen, extra, metrics = collect(args, env, net, state.params, state.env, keys[0])
-    raw, ensemble, judged = judge(args, member, state.ensemble, seen)
+    raw, ensemble, judged = judge(member, state.ensemble, seen)
     reward = roll.reward + args.disagreement_coef * env.dt * raw / ensemble.scale
 
     if args.policy == "explore":
@@ -570,8 +570,9 @@ def create_files(out, args, env, iterations):
         files = {}
         for name, (shape, dtype) in shapes.items():
             files[name] = np.lib.format.open_memmap(out / f"{name}.npy", "w+", dtype, shape)
-            with (out / f"{name}.npy").open("r+b") as file:  # writing to a mapped file on a full disk is fatal
-                os.posix_fallocate(file.fileno(), 0, os.fstat(file.fileno()).st_size)
+            if hasattr(os, "posix_fallocate"):  # writing to a mapped file on a full disk is fatal; macOS cannot reserve
+                with (out / f"{name}.npy").open("r+b") as file:
+                    os.posix_fallocate(file.fileno(), 0, os.fstat(file.fileno()).st_size)
     except OSError as error:
         for name in shapes:
             (out / f"{name}.npy").unlink(missing_ok=True)

@@ -269,7 +269,7 @@ def make_net(args, env):
 
 
 def load_pidm(path, env):
-    """Weights and normalizer of a PIDM checkpoint; UserError if it was made for another robot, layout of x or K."""
+    """Params and normalizer of a PIDM checkpoint; UserError if it was made for another robot, layout of x or K."""
     pidm, meta = records.load(path, "PIDM checkpoint")
     for name, ours in (("robot", env.robot.name), ("layout", list(env.prop_layout)), ("history", env.config.history)):
         if meta[name] != ours:
@@ -278,21 +278,26 @@ def load_pidm(path, env):
 
 
 def shuffle(tree, key):
-    """A control beyond the paper: permute the numbers within each weight matrix. Keeps scales, destroys knowledge."""
+    """A control beyond the paper: permute the numbers of each kernel and bias. Keeps scales, destroys knowledge."""
     leaves, structure = jax.tree.flatten(tree)
     keys = jax.random.split(key, len(leaves))
     mixed = [jax.random.permutation(k, leaf.ravel()).reshape(leaf.shape) for k, leaf in zip(keys, leaves, strict=True)]
     return structure.unflatten(mixed)
 
 
-def warm_start(args, params, pidm):
+def loaded_branches(args):
+    """Which of actor and critic start from the PIDM."""
+    if not args.pretrained:
+        return ()
+    return (args.init,) if args.init in ("actor", "critic") else ("actor", "critic")
+
+
+def warm_start(args, params, weights):
     """Copy the PIDM's history_encoder and backbone into actor and critic, or into the one that args.init names."""
     params = jax.tree.map(lambda x: x, params)  # new dicts, so that the caller's stay as they are
-    weights = {name: pidm["params"][name] for name in CORE}
     if args.init == "shuffled":
         weights = shuffle(weights, jax.random.fold_in(jax.random.key(args.seed), 1))
-    for branch in (args.init,) if args.init in ("actor", "critic") else ("actor", "critic"):
-        records.check_shapes(args.pretrained, weights, {name: params["params"][branch][name] for name in CORE})
+    for branch in loaded_branches(args):
         params["params"][branch] |= jax.tree.map(jnp.asarray, weights)
     return params
 
@@ -310,18 +315,22 @@ def init_params(args, env, net, key):
     if args.network == "mlp":
         return params
     # every arm has the same input scaling, so that they differ in nothing but the weights
-    pidm = load_pidm(Path(args.pretrained or SHIPPED / f"{env.robot.name}.msgpack"), env)
-    params = params | {"normalizer": {name: jnp.asarray(pidm["normalizer"][name]) for name in params["normalizer"]}}
-    return warm_start(args, params, pidm) if args.pretrained else params
+    path = Path(args.pretrained or SHIPPED / f"{env.robot.name}.msgpack")
+    pidm = load_pidm(path, env)
+    core = {name: params["params"]["actor"][name] for name in CORE}
+    for part, wanted in (("params", core), ("normalizer", params["normalizer"])):
+        pidm[part] = {name: x for name, x in pidm.get(part, {}).items() if name in wanted}
+        records.check_shapes(path, pidm[part], wanted)
+    params = params | {"normalizer": jax.tree.map(jnp.asarray, pidm["normalizer"])}
+    return warm_start(args, params, pidm["params"])
 
 
 def describe(args, params):
     """One line a submodule of actor and critic: its layers, and whether it was loaded."""
-    loads = {"actor": ("actor",), "critic": ("critic",)}.get(args.init, ("actor", "critic"))
     for branch in ("actor", "critic"):
         for name, part in params["params"][branch].items():
             shapes = [layer["kernel"].shape for layer in part.values()]
-            loaded = args.pretrained and branch in loads and name in CORE
+            loaded = branch in loaded_branches(args) and name in CORE
             widths = "-".join(str(width) for width in (shapes[0][0], *(shape[1] for shape in shapes)))
             print(f"  {branch:6} {name:18} {'loaded' if loaded else 'fresh ':6}  {widths}")
 
@@ -656,12 +665,12 @@ def train(args):
     """Run PPO to the end, or to Ctrl-C; either way the folder holds a policy, the metrics and their curve."""
     env = make_env(args)
     args = merge(args, env.config.ppo)
+    net = make_net(args, env)
+    opt = optax.scale_by_adam()
+    state = init_state(args, env, net, opt)  # before the folder is touched: the checkpoint may be refused
     out = records.start_run(args, env.config, args.run_dir, args.force)
     print(f"{args.task}: observation {env.obs_dim}, action {env.action_dim}, engine {type(env.engine).__name__}")
     print("  ".join(f"{name}={value}" for name, value in dataclasses.asdict(args).items()), flush=True)
-    net = make_net(args, env)
-    opt = optax.scale_by_adam()
-    state = init_state(args, env, net, opt)
     if args.network == "pidm":
         describe(args, state.params)
 

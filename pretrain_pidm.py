@@ -9,10 +9,9 @@ Shapes in comments: B batch, X proprioception x_t, A action, K history.
 
 import dataclasses
 import json
-import queue
 import sys
-import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -196,6 +195,7 @@ def read_meta(folder):
         held_out = meta["validation_envs"]
         sane = all(isinstance(size, int) and 0 < size < 10**9 for size in sizes)
         sane = sane and all(isinstance(env, int) and 0 <= env < meta["num_envs"] for env in held_out)
+        sane = sane and {"layout", "transitions", "args", "versions"} <= meta.keys() and isinstance(meta["robot"], str)
     except FileNotFoundError:
         what = "an unfinished collection (no meta.json)" if Path(folder).is_dir() else "not a folder"
         raise records.UserError(f"{folder} is {what}; run ppo_explore.py first") from None
@@ -221,17 +221,16 @@ def read_array(folder, name, meta):
 
 
 def batches(dataset, index, size):
-    """Yield windows of `size` transitions each, in the order of `index`, gathered on a thread of their own."""
-    ready = queue.Queue(maxsize=4)
+    """Yield windows of `size` transitions each, in the order of `index`; the next is gathered on another thread."""
 
-    def gather():
-        for start in range(0, len(index), size):
-            ready.put(dataset.windows(np.sort(index[start : start + size])))  # sorted: neighbours share pages
-        ready.put(None)
+    def gather(start):
+        return dataset.windows(np.sort(index[start : start + size]))  # sorted: neighbours share pages
 
-    threading.Thread(target=gather, daemon=True).start()
-    while (batch := ready.get()) is not None:
-        yield batch
+    with ThreadPoolExecutor(1) as pool:
+        upcoming = pool.submit(gather, 0)
+        for start in range(size, len(index) + size, size):
+            batch, upcoming = upcoming.result(), pool.submit(gather, start)
+            yield batch
 
 
 # --- Augmentation ---
@@ -458,7 +457,8 @@ def run_epochs(args, env, net, dataset, order, step, carry, out):
     """All epochs; keeps the weights with the least error on (at most 50,000) validation transitions. Returns rows."""
     few = np.sort(np.random.default_rng(args.seed).permutation(dataset.validation)[:50_000])
     rows, start, best = [], time.perf_counter(), np.inf
-    with records.Reporter(args.epochs, ("train_error", "error", "normalized_error", "last_action_error")) as reporter:
+    names = ("train_error", "error", "normalized_error", "last_action_error")
+    with records.Reporter(args.epochs, names, over="samples") as reporter:
         while len(rows) < args.epochs and not reporter.stopped:
             last = time.perf_counter()
             carry, loss = run_epoch(args, dataset, order, step, carry, len(rows))

@@ -52,6 +52,15 @@ class Config:
 # Half-width of uniform sensor noise (tasks of Isaac Lab); commands and the last action are exact.
 NOISE = {"lin_vel": 0.1, "ang_vel": 0.2, "gravity": 0.05, "joint_pos": 0.01, "joint_vel": 1.5}
 PROP = {"ang_vel": "axial", "gravity": "polar", "joint_pos": "joint", "joint_vel": "joint"}  # x_t, in order
+# Observation blocks of the robot itself -> (mirror kind, fixed scale), as `Env.OBS` lists them.
+BODY = {
+    "lin_vel": ("polar", 2.0),
+    "ang_vel": ("axial", 0.25),
+    "gravity": ("polar", 1.0),
+    "joint_pos": ("joint", 1.0),
+    "joint_vel": ("joint", 0.05),
+    "action": ("joint", 0.5),
+}
 BLOWN_UP = 1e3  # [m, m/s, rad/s] no sound simulation gets here
 
 
@@ -111,7 +120,7 @@ class Motion:
 
 @flax.struct.dataclass
 class FootClocks:
-    """How long each foot has been in the air or on the ground; a task family's state builds on it."""
+    """How long each foot has been in the air or on the ground, for tasks that reward a gait."""
 
     air_time: jax.Array  # (F,) [s] since the foot left the ground
     contact_time: jax.Array  # (F,) [s] since it landed
@@ -220,9 +229,8 @@ class Env:
         return 0
 
     def course(self, key, curriculum):
-        """Obstacles (and goal) of an episode."""
-        nowhere = self.engine.initial(*[jnp.zeros(())] * 4)
-        return Course(nowhere.mocap_pos, nowhere.mocap_quat, curriculum)
+        """Obstacles (and goal) of an episode; none here."""
+        return Course(jnp.zeros((0, 3)), jnp.zeros((0, 4)), curriculum)
 
     def init_task(self, key, physics, course):
         """The task's own state at the start of an episode."""
@@ -240,7 +248,7 @@ class Env:
 
     def track(self, task, motion):
         """Bring the task state up to this step's motion, before rewards."""
-        return task.tick(motion.foot_contact, self.dt)
+        return task
 
     def rewards(self, task, motion, action, last_action, clock):
         """Reward terms by name, unweighted, per second; those without a weight are ignored."""

@@ -2,7 +2,7 @@
 
 A course is drawn as (poses, goal): poses (M, 4) of slab centres x, y, z [m] and tilt about y [rad] in the order of the
 skill's slabs, and the goal (3,) for the base [m]. The robot starts at x = 0 and faces +x. `t` is the level's difficulty
-from 0 to 1. Sizes and ranges: Hoeller et al. 2023 where published, else ours (Sec. 8 of our task notes).
+from 0 to 1. Sizes and ranges: Hoeller et al. 2023 where published, else ours.
 """
 
 from collections.abc import Callable

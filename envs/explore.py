@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from envs import rewards, terrain
-from envs.base import Config, Env, FootClocks, uniform
+from envs.base import BODY, Config, Env, FootClocks, uniform
 from envs.locomotion import G1_LOCO
 
 
@@ -27,13 +27,7 @@ class ExploreConfig(Config):
 
 
 class Explore(Env):
-    OBS = {
-        "ang_vel": ("axial", 0.25),
-        "gravity": ("polar", 1.0),
-        "joint_pos": ("joint", 1.0),
-        "joint_vel": ("joint", 0.05),
-        "action": ("joint", 0.5),
-    }
+    OBS = {name: BODY[name] for name in BODY if name != "lin_vel"}
 
     def __init__(self, config, engine="auto"):
         self.heights = terrain.perlin_heights(config.amplitude)
@@ -72,6 +66,9 @@ class Explore(Env):
     def init_task(self, key, physics, course):
         feet = jnp.zeros(len(self.robot.feet))
         return FootClocks(feet, feet, feet)
+
+    def track(self, task, motion):
+        return task.tick(motion.foot_contact, self.dt)
 
     def rewards(self, task, motion, action, last_action, clock):
         return {

@@ -75,6 +75,9 @@ class Locomotion(Env):
         turn = jnp.clip(0.5 * wrap(task.heading - yaw), -self.config.yaw_rate, self.config.yaw_rate)
         return task.replace(command=jnp.where(task.moves, task.command.at[2].set(turn), 0.0))
 
+    def track(self, task, motion):
+        return task.tick(motion.foot_contact, self.dt)
+
     def advance(self, key, task, motion, clock):
         command, heading, moves = self.draw_command(key)
         fresh = task.replace(command=command, heading=heading, moves=moves)

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from envs import rewards, terrain
-from envs.base import Config, Course, Env, FootClocks, axis_angle, inverse, rotate, uniform, wrap
+from envs.base import BODY, Config, Course, Env, axis_angle, inverse, rotate, uniform, wrap
 from envs.courses import SKILLS
 
 LEVELS = 10
@@ -42,7 +42,7 @@ class ParkourCourse(Course):
 
 
 @flax.struct.dataclass
-class Task(FootClocks):
+class Task:
     """State of a parkour episode."""
 
     goal: jax.Array  # (3,) [m]
@@ -56,13 +56,7 @@ class Task(FootClocks):
 
 
 class Parkour(Env):
-    OBS = {
-        "lin_vel": ("polar", 2.0),
-        "ang_vel": ("axial", 0.25),
-        "gravity": ("polar", 1.0),
-        "joint_pos": ("joint", 1.0),
-        "joint_vel": ("joint", 0.05),
-        "action": ("joint", 0.5),
+    OBS = BODY | {
         "goal": ("polar", 0.5),
         "time_left": ("scalar", 1.0),
         "heading": ("heading", 1.0),
@@ -139,13 +133,10 @@ class Parkour(Env):
 
     def init_task(self, key, physics, course):
         k_yaw, k_shift = jax.random.split(key)
-        feet, still = jnp.zeros(len(self.robot.feet)), jnp.zeros((len(self.robot.feet), 3))
+        still = jnp.zeros((len(self.robot.feet), 3))
         way = course.goal[:2] - physics.qpos[:2]
         shift = uniform(k_shift, -self.config.scan_shift, self.config.scan_shift, (3,))
         return Task(
-            feet,
-            feet,
-            feet,
             goal=course.goal,
             goal_yaw=jnp.arctan2(way[1], way[0]) + uniform(k_yaw, -0.3, 0.3),
             far=jnp.linalg.norm(way),
@@ -214,7 +205,7 @@ class Parkour(Env):
 
     def track(self, task, motion):
         acc = (motion.foot_vel - task.foot_vel) / self.dt
-        return super().track(task, motion).replace(foot_vel=motion.foot_vel, foot_acc=acc)
+        return task.replace(foot_vel=motion.foot_vel, foot_acc=acc)
 
     def rewards(self, task, motion, action, last_action, clock):
         m, distance = motion, self.distance(task, motion)

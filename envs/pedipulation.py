@@ -12,7 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from envs import rewards
-from envs.base import Config, Env, FootClocks, inverse, rotate, uniform
+from envs.base import BODY, Config, Env, inverse, rotate, uniform
+from envs.locomotion import BLIND_QUADRUPED
 
 
 @dataclass(frozen=True)
@@ -30,7 +31,7 @@ class PedipulationConfig(Config):
 
 
 @flax.struct.dataclass
-class Task(FootClocks):
+class Task:
     """State of pedipulation."""
 
     point: jax.Array  # (3,) wanted foot position, world [m]
@@ -40,15 +41,7 @@ class Task(FootClocks):
 
 
 class Pedipulation(Env):
-    OBS = {
-        "lin_vel": ("polar", 2.0),
-        "ang_vel": ("axial", 0.25),
-        "gravity": ("polar", 1.0),
-        "joint_pos": ("joint", 1.0),
-        "joint_vel": ("joint", 0.05),
-        "action": ("joint", 0.5),
-        "target": ("polar", 1.0),
-    }
+    OBS = BODY | {"target": ("polar", 1.0)}
 
     SHOWCASE = {"fixed_point": (0.7, -0.2, 0.5)}
 
@@ -71,8 +64,8 @@ class Pedipulation(Env):
         return {"difficulty": jnp.minimum(task.difficulty + grown, 10.0)}
 
     def init_task(self, key, physics, course):
-        feet, zero, difficulty = jnp.zeros(len(self.robot.feet)), jnp.zeros(()), course.curriculum["difficulty"]
-        return Task(feet, feet, feet, self.draw_point(key, difficulty), difficulty, zero, zero)
+        zero, difficulty = jnp.zeros(()), course.curriculum["difficulty"]
+        return Task(self.draw_point(key, difficulty), difficulty, zero, zero)
 
     def draw_point(self, key, difficulty):
         """A point (3,) in the box of this difficulty."""
@@ -84,7 +77,7 @@ class Pedipulation(Env):
 
     def track(self, task, motion):
         error = self.foot_error(task, motion)
-        return super().track(task, motion).replace(error_sum=task.error_sum + error, steps=task.steps + 1)
+        return task.replace(error_sum=task.error_sum + error, steps=task.steps + 1)
 
     def advance(self, key, task, motion, clock):
         return task.replace(
@@ -142,13 +135,7 @@ ANYMAL_PEDIPULATION = PedipulationConfig(
         "action_rate": -0.01,
         "collision": -2.0,
     },
-    ppo={
-        "hidden": (128, 128, 128),
-        "entropy": 0.0,
-        "init_std": 1.0,
-        "cpu": {"num_envs": 256, "total_steps": 10_000_000},
-        "gpu": {"total_steps": 393_000_000},
-    },
+    ppo=BLIND_QUADRUPED | {"cpu": {"num_envs": 256, "total_steps": 10_000_000}, "gpu": {"total_steps": 393_000_000}},
     episode_seconds=12.0,
     termination_reward=-1.6,
     spawn_xy=0.0,

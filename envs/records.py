@@ -182,9 +182,9 @@ def plot_curves(rows, names, groups, path, over="env_steps"):
 class Reporter:
     """Progress: a live bar on a terminal, one plain line a row elsewhere. Ctrl-C sets `stopped`, to end after a row."""
 
-    def __init__(self, total, names):
-        """total: iterations of the run; names: the columns to show."""
-        self.total, self.names, self.bar, self.stopped = total, names, None, False
+    def __init__(self, total, names, over="env_steps"):
+        """total: iterations of the run; names: the columns to show; over: the column that counts the work done."""
+        self.total, self.names, self.over, self.bar, self.stopped = total, names, over, None, False
 
     def stop(self, *_):
         self.stopped = True  # an exception could strike inside the physics callback
@@ -207,8 +207,7 @@ class Reporter:
 
     def show(self, row, speed):
         shown = {name: row[name] for name in self.names if name in row}
-        count = row["env_steps"] if "env_steps" in row else row["samples"]
-        text = f"{count / 1e6:.2f}M {'steps' if 'env_steps' in row else 'samples'}  {speed:,.0f}/s  {line(shown)}"
+        text = f"{row[self.over] / 1e6:.2f}M {self.over.removeprefix('env_')}  {speed:,.0f}/s  {line(shown)}"
         if self.bar:
             self.bar.update(self.task, completed=row["iteration"], description=text)
         else:

@@ -83,6 +83,9 @@ def run(args, task, words, folder):
 
 def main(args):
     """All seeds of a method come after one seed of every method, so that a stopped study can be compared."""
+    for name in {*args.tasks} - envs.TASKS.keys() | {*args.methods} - METHODS.keys():
+        print(f"error: unknown task or method {name!r}; known: {', '.join([*envs.TASKS, *METHODS])}", file=sys.stderr)
+        sys.exit(2)
     start = time.perf_counter()
     for task in args.tasks:
         for seed in args.seeds:

@@ -297,6 +297,9 @@ def test_bad_datasets_are_refused(tmp_path, capsys):
     check(folder, "unfinished collection")
     (folder / "meta.json").write_text(meta[:40])
     check(folder, "meta.json is damaged")
+    for name in ("robot", "layout", "versions"):
+        (folder / "meta.json").write_text(json.dumps({k: v for k, v in json.loads(meta).items() if k != name}))
+        check(folder, "meta.json is damaged")
     (folder / "meta.json").write_text(meta)
     whole = (folder / "x.npy").read_bytes()
     (folder / "x.npy").write_bytes(whole[:-100])
@@ -339,9 +342,37 @@ def test_bad_checkpoints_are_refused(pretrained, tmp_path, capsys):
     policy = tmp_path / "policy.msgpack"
     records.save(policy, params, {"task": "go1_loco", "args": {}})
     check(policy, "not a PIDM checkpoint")
+    empty = tmp_path / "empty.msgpack"
+    records.save(empty, {"params": params["params"]}, meta)
+    check(empty, "action_mean", "is None, this task needs")
     small = tmp_path / "small.msgpack"
     records.save(small, jax.tree.map(lambda x: x[..., :-1], params), meta)
     check(small, "this task needs")
+
+
+def test_a_refused_checkpoint_costs_no_run(pretrained, tmp_path, capsys):
+    """Even with --force: what the folder held is still there."""
+    (tmp_path / "metrics.csv").write_text("old\n")
+    args = finetune.Args(task="anymal_loco", preset="smoke", pretrained=str(pretrained / "pidm.msgpack"))
+    refused(capsys, finetune.main, dataclasses.replace(args, run_dir=str(tmp_path), force=True), "robot go1")
+    assert [path.name for path in tmp_path.iterdir()] == ["metrics.csv"]
+    assert (tmp_path / "metrics.csv").read_text() == "old\n"
+
+
+def test_gathering_errors_are_raised(dataset, monkeypatch):
+    """What goes wrong on the gathering thread reaches the training instead of stopping it for ever."""
+    monkeypatch.setattr(dataset, "windows", lambda index: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        list(script.batches(dataset, dataset.train, 8))
+
+
+def test_batches_are_all_of_the_index_in_order(dataset):
+    """Sizes 8, 8, ..., rest; each batch the windows of its own part of the index, sorted."""
+    index = np.random.default_rng(0).permutation(dataset.train)
+    got = list(script.batches(dataset, index, 8))
+    assert [len(batch["pad"]) for batch in got] == [8] * (len(index) // 8) + [len(index) % 8] * (len(index) % 8 > 0)
+    for i, batch in enumerate(got):
+        np.testing.assert_array_equal(batch["action"], dataset.windows(np.sort(index[8 * i : 8 * i + 8]))["action"])
 
 
 def test_init_without_pretrained_is_refused(capsys):
