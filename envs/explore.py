@@ -94,7 +94,7 @@ SHARED = {
     "push_seconds": (3.0, 6.0),
 }
 
-# Regularisers of the size of what the ensemble pays, 1 per second; sums over G1's 29 joints weigh 12 / 29.
+# Regularisers of at most the size of what the ensemble pays, 2 per second; sums over G1's 29 joints weigh 12 / 29.
 EXPLORE = {
     "anymal_d": ExploreConfig(
         robot="anymal_d",

@@ -78,6 +78,29 @@ def early_states(task, count=20_000):
     return seen[np.linspace(0, len(seen) - 1, count).astype(int)]
 
 
+def walking_error(robot, task, num_envs=256, steps=200):
+    """Normalised error of the shipped PIDM on what the recorded policy of `task` does: noisy actions and sensors."""
+    params, meta = records.load(ROOT / f"results/loco/{task}/policy.msgpack", "policy")
+    env = ppo_finetune.envs.make(task, "c")
+    args = ppo_finetune.Args(**{name: meta["args"][name] for name in ("task", "network", "init_std", "hidden")})
+    net, pidm = ppo_finetune.make_net(args, env), pretrain_pidm.PIDM(pretrain_pidm.SIZES[robot], env.action_dim)
+    weights, _ = records.load(ROOT / f"assets/pidm/{robot}.msgpack", "PIDM checkpoint")
+
+    def step(state, key):
+        mean, log_std, _ = net.apply(params, ppo_finetune.net_inputs(net, state.obs, state.history))
+        action = mean + jnp.exp(log_std) * jax.random.normal(key, mean.shape)
+        history, state = state.history, jax.vmap(env.step)(state, action)
+        window = {"prop": history["prop"], "past": history["action"], "next_x": state.final_history["prop"][:, -1]}
+        return state, (jnp.abs(pretrain_pidm.predict(pidm, weights, window) - action).mean(), jnp.abs(action).mean())
+
+    @jax.jit
+    def rollout(state):
+        return jax.lax.scan(step, state, jax.random.split(jax.random.key(1), steps))[1]
+
+    error, size = rollout(jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), num_envs)))
+    return float(error.mean() / size.mean())
+
+
 def occupied(env, x, bins=20):
     """Share of a grid over each pair of joints of a limb that x (S, X) visits, mean over pairs."""
     low, high = env.model.jnt_range[1:].T
@@ -154,6 +177,7 @@ def look(args, robot):
     kept = ROOT / f"results/pidm/{robot}"
     coverage = {f"joint space, {name}": occupied(env, x) for name, x in kinds.items()}
     coverage |= novelty(env, pretrain_pidm.Dataset(ROOT / f"runs/explore/{robot}/seed0"), kept / "novelty.png")
+    coverage[f"normalized_error, recorded policy of {task}"] = walking_error(robot, task)
     print(robot, records.line(coverage))
     records.replace_text(kept / "coverage.json", json.dumps(coverage, indent=1) + "\n")
     name, points = project([x[::5] for x in kinds.values()])
