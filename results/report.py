@@ -134,8 +134,8 @@ def table(task, runs):
     reached = [iterations_to(run, level) for run in baseline]
     lines = [
         "| method | seeds | final return | % of random | iterations to 90% | % of random | area, % of random "
-        "| velocity error [m/s] | falls | minutes | paper: final %, iterations % |",
-        "|---|---|---|---|---|---|---|---|---|---|---|",
+        "| mean action: return | velocity error [m/s] | falls | minutes | paper: final %, iterations % |",
+        "|---|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     for method, title in METHODS.items():
         if method not in runs:
@@ -151,6 +151,7 @@ def table(task, runs):
             "not reached" if np.isnan(counts).all() else f"{np.nanmean(counts):.0f}",
             against_random(counts, reached, own),
             against_random([area(run) for run in mine], [area(run) for run in baseline], own),
+            f"{np.mean([run['errors']['episode_return'] for run in mine]):.2f}",
             f"{np.mean([run['errors']['lin_vel_error'] for run in mine]):.3f}",
             f"{100 * np.mean([run['errors']['falls'] for run in mine]):.0f}%",
             f"{np.mean([run['seconds'] for run in mine]) / 60:.1f}",
@@ -211,10 +212,11 @@ def beside(folder):
 
 HEAD = """# Study
 
-Written by `python results/report.py` from the runs beside it; `--check` compares. Return is that of the noisy policy in
-training; velocity error and falls are the mean action's, over 64 episodes of 20 s. Percentages are against PIDM random,
-with 95% bootstrap intervals over seeds (with so few seeds they are rough). `PIDM shuffled` has the pretrained weights
-permuted within each layer: the same scale, no knowledge.
+Written by `python results/report.py` from the runs beside it; `--check` compares. Final return and area are the noisy
+policy's in training; then follow return, velocity error and falls of its mean action, over 64 episodes of 20 s.
+Percentages are against PIDM random, with 95% bootstrap intervals over seeds (with so few seeds they are rough).
+`PIDM shuffled` has the pretrained weights permuted within each layer: the same scale, no knowledge. Minutes are of
+machines that may have run two trainings at once.
 
 ![curves](curves.png)
 """

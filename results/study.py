@@ -1,6 +1,7 @@
 """Run the comparison: tasks x methods x seeds of ppo_finetune.py, what is missing only.
 
     python results/study.py --tasks go1_loco --seeds 0 1 2 --total-steps 5000000
+    python results/study.py --tasks anymal_loco --jobs 2
     python results/study.py --list
 
 A run is trained and evaluated in runs/study/<scale>/<task>/<method>/seed<k>; its small files are kept under
@@ -8,12 +9,14 @@ results/study in the same folders, where report.py reads them.
 """
 
 import csv
+import itertools
 import json
 import shlex
 import shutil
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -43,6 +46,7 @@ class Args:
     seeds: tuple[int, ...] = (0, 1, 2)
     scale: str = "cpu"  # preset
     total_steps: int | None = None  # None: the preset's
+    jobs: int = 1  # runs at once, on the same machine: together a little faster, each slower
     budget_minutes: float = 1e9  # start no run after this
     list: bool = False  # print the training commands and stop
 
@@ -87,20 +91,22 @@ def main(args):
         print(f"error: unknown task or method {name!r}; known: {', '.join([*envs.TASKS, *METHODS])}", file=sys.stderr)
         sys.exit(2)
     start = time.perf_counter()
-    for task in args.tasks:
-        for seed in args.seeds:
-            for method in args.methods:
-                folder = f"study/{args.scale}/{task}/{method}/seed{seed}"
-                words = command(args, task, method, folder, seed)
-                if args.list:
-                    print(shlex.join(["python", *words]))
-                elif finished(folder):
-                    print(f"done     {folder}", flush=True)
-                elif time.perf_counter() - start > 60 * args.budget_minutes:
-                    print(f"no time  {folder}", flush=True)
-                else:
-                    run(args, task, words, folder)
-                    print(f"ran      {folder}  {(time.perf_counter() - start) / 60:.1f} min", flush=True)
+
+    def one(task, seed, method):
+        folder = f"study/{args.scale}/{task}/{method}/seed{seed}"
+        words = command(args, task, method, folder, seed)
+        if args.list:
+            print(shlex.join(["python", *words]))
+        elif finished(folder):
+            print(f"done     {folder}", flush=True)
+        elif time.perf_counter() - start > 60 * args.budget_minutes:
+            print(f"no time  {folder}", flush=True)
+        else:
+            run(args, task, words, folder)
+            print(f"ran      {folder}  {(time.perf_counter() - start) / 60:.1f} min", flush=True)
+
+    with ThreadPoolExecutor(args.jobs) as pool:
+        list(pool.map(lambda cell: one(*cell), itertools.product(args.tasks, args.seeds, args.methods)))
 
 
 if __name__ == "__main__":

@@ -40,3 +40,19 @@ class Jitted:
 def jitted():
     """jitted(task, **overrides) -> Jitted, cached."""
     return functools.cache(Jitted)
+
+
+@pytest.fixture
+def refused(capsys):
+    """refused(main, args, *words): the script ends with exit code 2 and one line on stderr that holds these words."""
+
+    def check(main, args, *words):
+        capsys.readouterr()
+        with pytest.raises(SystemExit) as stop:
+            main(args)
+        err = capsys.readouterr().err
+        assert stop.value.code == 2 and err.count("\n") == 1 and err.startswith("error: "), err
+        for word in words:
+            assert word in err, err
+
+    return check

@@ -143,6 +143,19 @@ def test_equal_members_do_not_disagree(fitted):
     np.testing.assert_allclose(script.disagreement(mean), 0.0, atol=1e-10)
 
 
+def test_reward_scale_leaves_the_untrained_ensemble_behind(fitted):
+    """Twenty rollouts after its start at a tenfold disagreement the scale is within 15% of the present one."""
+    member, _, ensemble, _, buffer = fitted
+    seen = jax.tree.map(lambda x: x[:64].reshape(8, 8, *x.shape[1:]), buffer)
+    raw, ensemble, metrics = script.judge(member, ensemble, seen)
+    assert raw.shape == (8, 8)
+    np.testing.assert_allclose(ensemble.scale, metrics["disagreement"])  # the first rollout sets it
+    ensemble = ensemble.replace(scale=10 * ensemble.scale)
+    for _ in range(20):
+        _, ensemble, _ = script.judge(member, ensemble, seen)
+    assert 1.0 < ensemble.scale / raw.mean() < 1.15
+
+
 def test_disagreement_is_the_variance_over_members():
     mean = np.random.default_rng(0).normal(size=(5, 7, 3))
     want = [np.mean([np.var(mean[:, b, a]) for a in range(3)]) for b in range(7)]
@@ -227,15 +240,6 @@ def test_stages_one_to_three_through_files(collected, tmp_path):
 # --- faults ---
 
 
-def refused(capsys, args, *words):
-    with pytest.raises(SystemExit) as stop:
-        script.main(args)
-    err = capsys.readouterr().err
-    assert stop.value.code == 2 and err.count("\n") == 1 and err.startswith("error: "), err
-    for word in words:
-        assert word in err, err
-
-
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
@@ -246,23 +250,23 @@ def refused(capsys, args, *words):
         ({"num_minibatches": 5}, ["5 minibatches do not divide"]),
     ],
 )
-def test_bad_arguments_are_refused(changes, words, tmp_path, capsys):
-    refused(capsys, dataclasses.replace(SMOKE, run_dir=str(tmp_path / "run"), **changes), *words)
+def test_bad_arguments_are_refused(changes, words, tmp_path, refused):
+    refused(script.main, dataclasses.replace(SMOKE, run_dir=str(tmp_path / "run"), **changes), *words)
     assert not (tmp_path / "run").exists()
 
 
-def test_data_are_not_overwritten(collected, capsys):
+def test_data_are_not_overwritten(collected, refused):
     before = (collected[0] / "x.npy").read_bytes()
-    refused(capsys, dataclasses.replace(SMOKE, run_dir=str(collected[0])), "--force")
+    refused(script.main, dataclasses.replace(SMOKE, run_dir=str(collected[0])), "--force")
     assert (collected[0] / "x.npy").read_bytes() == before
 
 
-def test_full_disk_is_one_line_and_leaves_no_arrays(tmp_path, capsys, monkeypatch):
+def test_full_disk_is_one_line_and_leaves_no_arrays(tmp_path, refused, monkeypatch):
     def full(*_):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(os, "posix_fallocate", full)
-    refused(capsys, dataclasses.replace(SMOKE, run_dir=str(tmp_path / "run")), "cannot reserve", "No space left")
+    refused(script.main, dataclasses.replace(SMOKE, run_dir=str(tmp_path / "run")), "cannot reserve", "No space left")
     assert not list((tmp_path / "run").glob("*.npy"))
 
 

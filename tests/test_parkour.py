@@ -1,5 +1,7 @@
 """Pedipulation and the parkour skills: courses against mj_ray, spawns, levels, scans, mirrors, rewards, endings."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -7,7 +9,8 @@ import numpy as np
 import pytest
 
 import envs
-from envs import courses, parkour
+import ppo_finetune as script
+from envs import courses, parkour, records
 
 SKILLS = {
     "anymal_parkour_walk": "walk",
@@ -318,6 +321,19 @@ def test_unknown_skill_is_refused():
         envs.make("anymal_jump", "c", skill="fly")
 
 
+def test_level_of_an_evaluation(jitted, tmp_path, refused):
+    """A policy is evaluated at a level that exists, of its own skill."""
+    env = jitted("anymal_jump").env
+    args = script.merge(script.Args(task="anymal_jump", preset="smoke", level=10), env.config.ppo)
+    net = script.make_net(args, env)
+    policy = tmp_path / "policy.msgpack"
+    params = net.init(jax.random.key(0), script.zero_inputs(env, net))
+    records.save(policy, params, {"task": args.task, "args": dataclasses.asdict(args)})
+    refused(script.main, dataclasses.replace(args, eval=str(policy)), "level 10 does not exist; choose 0 to 9")
+    other = dataclasses.replace(args, eval=str(policy), task="anymal_crouch", level=0)
+    refused(script.main, other, "is a policy for anymal_jump, not for anymal_crouch")
+
+
 # --- pedipulation ---
 
 
@@ -394,3 +410,17 @@ def test_same_observation_layout_across_skills():
     """A policy of one skill is refused where the observation differs (crouch sees a ceiling)."""
     sizes = {task: envs.make(task, "c").obs_dim for task in SKILLS}
     assert sizes.pop("anymal_crouch") == 348 and set(sizes.values()) == {282}
+
+
+def test_engines_agree_on_a_slab():
+    """A robot that stands on the box it will climb down from: both engines hold it up at the same place."""
+    heights = {}
+    for engine in ("c", "mjx"):
+        env = envs.make("anymal_climb_down", engine, level=4, noise=0.0, spawn_velocity=0.0, push_velocity=0.0)
+        state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(3), 4))
+        step = jax.jit(jax.vmap(env.step))
+        for _ in range(10):
+            state = step(state, jnp.zeros((4, 12)))
+        heights[engine] = np.asarray(state.physics.qpos[:, :3])
+    np.testing.assert_allclose(heights["c"], heights["mjx"], atol=0.02)
+    assert (heights["c"][:, 2] > 0.8).any()  # on the box of 0.5 m, but for the rough-ground episodes

@@ -274,20 +274,10 @@ def test_normalizer_is_not_trained(pretrained, tmp_path):
 # --- bad input ---
 
 
-def refused(capsys, run, args, *words):
-    """Exit code 2 and one line on stderr that holds these words."""
-    with pytest.raises(SystemExit) as stop:
-        run(args)
-    err = capsys.readouterr().err
-    assert stop.value.code == 2 and err.count("\n") == 1 and err.startswith("error: "), err
-    for word in words:
-        assert word in err, err
-
-
-def test_bad_datasets_are_refused(tmp_path, capsys):
+def test_bad_datasets_are_refused(tmp_path, refused):
     def check(folder, *words):
         out = tmp_path / "out"
-        refused(capsys, script.main, script.Args(data=str(folder), preset="smoke", run_dir=str(out)), *words)
+        refused(script.main, script.Args(data=str(folder), preset="smoke", run_dir=str(out)), *words)
         assert not out.exists()
 
     check(tmp_path / "none", "not a folder")
@@ -313,20 +303,20 @@ def test_bad_datasets_are_refused(tmp_path, capsys):
     check(random_dataset(tmp_path / "e", validation_envs=[]), "validation")
 
 
-def test_too_many_samples_are_refused(tmp_path, capsys):
+def test_too_many_samples_are_refused(tmp_path, refused):
     folder = random_dataset(tmp_path / "a")
     args = script.Args(data=str(folder), preset="smoke", num_samples=10**6, run_dir=str(tmp_path / "out"))
-    refused(capsys, script.main, args, "--num-samples 1000000")
+    refused(script.main, args, "--num-samples 1000000")
 
 
-def test_bad_checkpoints_are_refused(pretrained, tmp_path, capsys):
+def test_bad_checkpoints_are_refused(pretrained, tmp_path, refused):
     path = pretrained / "pidm.msgpack"
     params, meta = records.load(path, "PIDM checkpoint")
 
     def check(checkpoint, *words, task="go1_loco", **more):
         out = tmp_path / "out"
         args = finetune.Args(task=task, preset="smoke", pretrained=str(checkpoint), run_dir=str(out), **more)
-        refused(capsys, finetune.main, args, *words)
+        refused(finetune.main, args, *words)
         assert not (out / "metrics.csv").exists()
 
     check(path, "robot go1", "robot anymal_d", task="anymal_loco")
@@ -350,11 +340,11 @@ def test_bad_checkpoints_are_refused(pretrained, tmp_path, capsys):
     check(small, "this task needs")
 
 
-def test_a_refused_checkpoint_costs_no_run(pretrained, tmp_path, capsys):
+def test_a_refused_checkpoint_costs_no_run(pretrained, tmp_path, refused):
     """Even with --force: what the folder held is still there."""
     (tmp_path / "metrics.csv").write_text("old\n")
     args = finetune.Args(task="anymal_loco", preset="smoke", pretrained=str(pretrained / "pidm.msgpack"))
-    refused(capsys, finetune.main, dataclasses.replace(args, run_dir=str(tmp_path), force=True), "robot go1")
+    refused(finetune.main, dataclasses.replace(args, run_dir=str(tmp_path), force=True), "robot go1")
     assert [path.name for path in tmp_path.iterdir()] == ["metrics.csv"]
     assert (tmp_path / "metrics.csv").read_text() == "old\n"
 
@@ -375,5 +365,5 @@ def test_batches_are_all_of_the_index_in_order(dataset):
         np.testing.assert_array_equal(batch["action"], dataset.windows(np.sort(index[8 * i : 8 * i + 8]))["action"])
 
 
-def test_init_without_pretrained_is_refused(capsys):
-    refused(capsys, finetune.main, finetune.Args(preset="smoke", init="shuffled"), "--init shuffled needs --pretrained")
+def test_init_without_pretrained_is_refused(refused):
+    refused(finetune.main, finetune.Args(preset="smoke", init="shuffled"), "--init shuffled needs --pretrained")

@@ -49,7 +49,8 @@ def study(tmp_path, monkeypatch):
         folder = tmp_path / method / "seed0"
         folder.mkdir(parents=True)
         (folder / "args.json").write_text(json.dumps(args))
-        (folder / "eval.json").write_text(json.dumps({"task": {"lin_vel_error": 0.1, "falls": 0.0}}))
+        task = {"episode_return": 9.0, "lin_vel_error": 0.1, "falls": 0.0}
+        (folder / "eval.json").write_text(json.dumps({"task": task}))
         rows = [f"{i},{10 * i},{i},{2.0 * i}" for i in range(1, 5)]
         (folder / "metrics.csv").write_text("\n".join(["iteration,env_steps,seconds,episode_return", *rows]) + "\n")
     return tmp_path, args

@@ -28,15 +28,6 @@ def run(*arguments, **kwargs):
     return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300, check=False, **kwargs)
 
 
-def assert_refused(process, *words):
-    """Exit code 2 and one line on stderr that holds these words."""
-    assert process.returncode == 2, process.stderr
-    lines = [text for text in process.stderr.splitlines() if text.startswith("error: ")]
-    assert len(lines) == 1 and "Traceback" not in process.stderr, process.stderr
-    for word in words:
-        assert word in lines[0], lines[0]
-
-
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
     """A smoke run of g1_loco and its folder."""
@@ -119,35 +110,43 @@ def test_pictures_without_opengl(trained, tmp_path):
     assert "stick figures" in process.stdout and (tmp_path / "rollout.png").stat().st_size > 5000
 
 
-def test_wrong_policies_are_refused(trained, tmp_path):
+def test_wrong_policies_are_refused(trained, tmp_path, refused):
     policy = trained[0] / "policy.msgpack"
-    assert_refused(run("--task", "go1_loco", "--eval", policy), "is a policy for g1_loco, not for go1_loco")
-    assert_refused(run("--eval", tmp_path / "none.msgpack"), "cannot read policy", "No such file")
+
+    def check(path, *words, task="g1_loco"):
+        refused(script.main, script.Args(task=task, eval=str(path)), *words)
+
+    check(policy, "is a policy for g1_loco, not for go1_loco", task="go1_loco")
+    check(tmp_path / "none.msgpack", "cannot read policy", "No such file")
     cut = tmp_path / "cut.msgpack"
     cut.write_bytes(policy.read_bytes()[:-100])
-    assert_refused(run("--task", "g1_loco", "--eval", cut), "damaged")
+    check(cut, "damaged")
+    refused(script.main, script.Args(task="g1_loco", eval=str(policy), level=3), "g1_loco has no levels")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["cut.msgpack"]
 
 
 @pytest.mark.parametrize(
-    ("arguments", "words"),
+    ("changes", "words"),
     [
-        (["--task", "go2_loco"], ["unknown task 'go2_loco'", "go1_loco"]),
-        (["--engine", "bullet"], ["unknown engine 'bullet'", "c, mjx"]),
-        (["--num-envs", "0"], ["--num-envs must be at least 1"]),
-        (["--num-minibatches", "5"], ["5 minibatches do not divide", "16"]),
-        (["--total-steps", "-1"], ["--total-steps must be at least 1"]),
+        ({"task": "go2_loco"}, ["unknown task 'go2_loco'", "go1_loco"]),
+        ({"engine": "bullet"}, ["unknown engine 'bullet'", "c, mjx"]),
+        ({"num_envs": 0}, ["--num-envs must be at least 1"]),
+        ({"num_minibatches": 5}, ["5 minibatches do not divide", "16"]),
+        ({"total_steps": -1}, ["--total-steps must be at least 1"]),
     ],
 )
-def test_bad_arguments_are_refused(arguments, words, tmp_path):
-    assert_refused(run("--preset", "smoke", "--run-dir", tmp_path / "run", *arguments), *words)
+def test_bad_arguments_are_refused(changes, words, tmp_path, refused):
+    refused(script.main, dataclasses.replace(SMOKE, run_dir=str(tmp_path / "run"), **changes), *words)
     assert not (tmp_path / "run").exists()
 
 
 def test_a_run_is_not_overwritten(trained):
+    """In a process of its own: what a user sees of a refusal."""
     before = (trained[0] / "metrics.csv").read_bytes()
-    assert_refused(run("--preset", "smoke", "--task", "g1_loco", "--run-dir", trained[0]), "--force")
-    assert (trained[0] / "metrics.csv").read_bytes() == before
+    process = run("--preset", "smoke", "--task", "g1_loco", "--run-dir", trained[0])
+    assert process.returncode == 2 and "Traceback" not in process.stderr
+    assert [text.startswith("error: ") for text in process.stderr.splitlines()] == [True]
+    assert "--force" in process.stderr and (trained[0] / "metrics.csv").read_bytes() == before
 
 
 def test_unknown_preset_lists_the_right_ones():
