@@ -586,7 +586,7 @@ def evaluate(env, net, params, num_envs, level=None):
     for name, v in metrics.items():
         if name.startswith("episode_"):
             result[name] = (v * ended).sum() / ended.sum()
-        elif not name.startswith("reward/"):
+        elif "/" not in name:  # not the parts of a total
             result[name] = (v * alive).sum() / alive.sum()
     result["falls"] = fell.any(0).mean()
     return result, jax.tree.map(lambda x: x[0], env_state.physics), qpos

@@ -249,7 +249,7 @@ class Parkour(Env):
             "level": task.level.astype(jnp.float32),
             "progress": task.best / (LEVELS - 1),  # the paper's curriculum progress
             "episode_success": self.succeeded(task, motion, truncated).astype(jnp.float32),
-        }
+        } | {f"level/{i}": (task.level == i).astype(jnp.float32) for i in range(LEVELS)}
 
 
 # Deviation: of Hoeller et al.'s weights, base_acc, feet_acc and action_rate are reduced, position is floored, heading

@@ -80,7 +80,7 @@ def early_states(task, count=20_000):
 
 def walking_error(robot, task, num_envs=256, steps=200):
     """Normalised error of the shipped PIDM on what the recorded policy of `task` does: noisy actions and sensors."""
-    params, meta = records.load(ROOT / f"results/loco/{task}/policy.msgpack", "policy")
+    params, meta = records.load(ROOT / f"results/tasks/{task}/policy.msgpack", "policy")
     env = ppo_finetune.envs.make(task, "c")
     args = ppo_finetune.Args(**{name: meta["args"][name] for name in ("task", "network", "init_std", "hidden")})
     net, pidm = ppo_finetune.make_net(args, env), pretrain_pidm.PIDM(pretrain_pidm.SIZES[robot], env.action_dim)

@@ -1,0 +1,78 @@
+"""Train tasks as the README's table reports them, evaluate, and keep the small files in results/tasks/<task>.
+
+    python results/tasks.py --tasks anymal_climb_up anymal_jump
+    python results/tasks.py --tasks anymal_climb_up --stages look
+
+Where a task has levels, levels.png shows how many environments were at each at the end of training, and how often the
+trained policy's mean action succeeds there.
+"""
+
+import csv
+import json
+import shutil
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import tyro
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(ROOT))
+
+import envs
+from envs import records
+
+KEPT = ("args.json", "metrics.csv", "curve.png", "eval.json", "policy.msgpack", "rollout.png", "rollout.gif")
+
+
+@dataclass(frozen=True)
+class Args:
+    tasks: tuple[str, ...] = tuple(envs.TASKS)
+    preset: Literal["smoke", "cpu", "gpu"] = "cpu"
+    stages: tuple[Literal["train", "look"], ...] = ("train", "look")
+
+
+def draw_levels(folder):
+    """levels.png of a kept run: share of environments and success of the mean action over levels."""
+    with (folder / "metrics.csv").open() as file:
+        last = list(csv.DictReader(file))[-1]
+    result = json.loads((folder / "eval.json").read_text())
+    names = [name for name in last if name.startswith("level/")]
+    level = np.arange(len(names))
+    plt = records.pyplot()
+    fig, ax = plt.subplots(figsize=(4.5, 2.8), constrained_layout=True)
+    ax.bar(level - 0.2, [float(last[name]) for name in names], 0.4, label="environments at the end of training")
+    success = [result[f"level {i}"]["episode_success"] for i in level]
+    ax.bar(level + 0.2, success, 0.4, label="success of the mean action")
+    ax.set(xlabel="level", xticks=level, ylim=(0, 1), title=folder.name)
+    ax.legend(fontsize=7)
+    ax.grid(alpha=0.3)
+    fig.savefig(folder / "levels.png", dpi=110, metadata={"Software": None})
+    plt.close(fig)
+
+
+def main(args):
+    for name in {*args.tasks} - envs.TASKS.keys():
+        print(f"error: unknown task {name!r}; known: {', '.join(envs.TASKS)}", file=sys.stderr)
+        sys.exit(2)
+    for task in args.tasks:
+        out, kept = ROOT / "runs/tasks" / task, ROOT / "results/tasks" / task
+        words = [sys.executable, "ppo_finetune.py", "--task", task]
+        if "train" in args.stages:
+            train = ["--preset", args.preset, "--run-dir", f"runs/tasks/{task}", "--force"]
+            subprocess.run([*words, *train], cwd=ROOT, check=True)
+        if "look" in args.stages:
+            subprocess.run([*words, "--eval", f"runs/tasks/{task}/policy.msgpack"], cwd=ROOT, check=True)
+            kept.mkdir(parents=True, exist_ok=True)
+            for name in KEPT:
+                shutil.copy(out / name, kept / name)
+            if "level 0" in json.loads((kept / "eval.json").read_text()):
+                draw_levels(kept)
+                print(f"wrote {kept / 'levels.png'}")
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Args, description=__doc__))
