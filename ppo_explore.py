@@ -621,7 +621,7 @@ def explore(args):
     args = merge(args, env.config.ppo)
     chunks = -(-args.total_steps // (args.num_envs * args.num_steps * args.log_every))
     iterations = chunks * args.log_every
-    out = records.start_run(args, env.config, args.run_dir, args.force)
+    out = records.start_run(args, env.config)
     files = create_files(out, args, env, iterations)
     print(f"{args.robot}: x {env.prop_dim}, action {env.action_dim}, engine {type(env.engine).__name__}")
     print("  ".join(f"{name}={value}" for name, value in dataclasses.asdict(args).items()), flush=True)

@@ -44,6 +44,7 @@ class Args:
     init: Literal["both", "actor", "critic", "shuffled"] = "both"  # what is loaded; shuffled: see `shuffle`
     preset: Literal["smoke", "cpu", "gpu"] = "cpu"  # scale: smoke 4 environments, cpu 256, gpu 4096
     seed: int = 0  # the only source of randomness
+    num_seeds: int = 1  # trainings in one program, with seed, seed + 1, ...; each with a run folder of its own
     engine: str = "auto"  # physics: c (CPU threads), mjx (accelerators), auto
     run_dir: str | None = None  # None: runs/<task>/<method>/seed<seed>
     force: bool = False  # overwrite the run in that folder
@@ -80,7 +81,8 @@ PRESETS = {
 }
 
 
-COUNTS = ("num_envs", "num_steps", "total_steps", "log_every", "num_epochs", "num_minibatches", "eval_envs")
+COUNTS = ("num_seeds", "num_envs", "num_steps", "total_steps", "log_every", "num_epochs", "num_minibatches")
+COUNTS += ("eval_envs",)
 
 
 def method_name(args):
@@ -101,7 +103,8 @@ def merge(args, ppo):
         raise records.UserError(f"--init {args.init} needs --pretrained CHECKPOINT")
     values = PRESETS[args.preset] | ppo.get(args.preset, {})
     values |= {"hidden": ppo["hidden"], "init_std": ppo["init_std"], "entropy_coef": ppo["entropy"]}
-    values |= {"run_dir": f"runs/{args.task}/{method_name(args)}/seed{args.seed}"}
+    folder = f"runs/{args.task}/{method_name(args)}"
+    values |= {"run_dir": folder if args.num_seeds > 1 else f"{folder}/seed{args.seed}"}
     args = dataclasses.replace(args, **{name: v for name, v in values.items() if getattr(args, name) is None})
     records.check_positive(args, COUNTS)
     records.check_minibatches(args)
@@ -344,6 +347,7 @@ class TrainState:
     opt_state: optax.OptState
     lr: jax.Array  # ()
     env: envs.base.State  # (N, ...)
+    key: jax.Array  # of the seed; stays, for an iteration folds in its number
     iteration: jax.Array  # () PPO iterations done
 
 
@@ -540,7 +544,7 @@ def update_magnitude(before, after):
 
 def iteration(args, env, net, opt, state):
     """One PPO iteration: rollout, advantages, update. Its randomness depends on (seed, iteration) alone."""
-    k_roll, k_update = jax.random.split(jax.random.fold_in(jax.random.key(args.seed), state.iteration))
+    k_roll, k_update = jax.random.split(jax.random.fold_in(state.key, state.iteration))
     env_state, roll, metrics = rollout(args, env, net, state.params, state.env, k_roll)
     last_value = net.apply(state.params, net_inputs(net, env_state.obs, env_state.history), method=net.value)
     advantage, ret = gae(args, roll.reward + roll.bootstrap, roll.done, roll.value, last_value)
@@ -552,16 +556,35 @@ def iteration(args, env, net, opt, state):
         "lr": lr,
         "action_std": jnp.exp(params["params"]["log_std"]).mean(),
     }
-    return TrainState(params, opt_state, lr, env_state, state.iteration + 1), metrics
+    return TrainState(params, opt_state, lr, env_state, state.key, state.iteration + 1), metrics
 
 
 def init_state(args, env, net, opt):
     """Fresh networks, and N environments whose episode clocks start anywhere, so that time-outs spread out."""
-    k_net, k_env, k_clock = jax.random.split(jax.random.key(args.seed), 3)
+    key = jax.random.key(args.seed)
+    k_net, k_env, k_clock = jax.random.split(key, 3)
     params = init_params(args, env, net, k_net)
     clocks = jax.random.randint(k_clock, (args.num_envs,), 0, env.episode_steps)
     env_state = jax.jit(jax.vmap(env.reset))(jax.random.split(k_env, args.num_envs), clocks)
-    return TrainState(params, opt.init(params), jnp.float32(args.lr), env_state, jnp.zeros((), jnp.int32))
+    return TrainState(params, opt.init(params), jnp.float32(args.lr), env_state, key, jnp.zeros((), jnp.int32))
+
+
+def one_for_each_seed(args):
+    """The arguments of every training of this run: with --num-seeds their folders are `run_dir`/seed<k>."""
+    seeds = range(args.seed, args.seed + args.num_seeds)
+    folders = [args.run_dir if args.num_seeds == 1 else f"{args.run_dir}/seed{seed}" for seed in seeds]
+    return [dataclasses.replace(args, seed=s, run_dir=f) for s, f in zip(seeds, folders, strict=True)]
+
+
+def make_chunk(args, env, net, opt):
+    """log_every iterations of all seeds' TrainStates (S, ...), which also returns their metrics (S, log_every)."""
+
+    def one_seed(state):
+        return jax.lax.scan(lambda s, _: iteration(args, env, net, opt, s), state, None, args.log_every)
+
+    # one after the other on a CPU, which a single seed fills; side by side on an accelerator
+    in_turn = jax.default_backend() == "cpu"
+    return jax.jit(lambda states: jax.lax.map(one_seed, states) if in_turn else jax.vmap(one_seed)(states))
 
 
 # --- Evaluation ---
@@ -662,46 +685,49 @@ def plot(rows, path):
 
 
 def train(args):
-    """Run PPO to the end, or to Ctrl-C; either way the folder holds a policy, the metrics and their curve."""
+    """Run PPO to the end, or to Ctrl-C; either way each seed's folder holds a policy, the metrics and their curve."""
     env = make_env(args)
     args = merge(args, env.config.ppo)
-    net = make_net(args, env)
-    opt = optax.scale_by_adam()
-    state = init_state(args, env, net, opt)  # before the folder is touched: the checkpoint may be refused
-    out = records.start_run(args, env.config, args.run_dir, args.force)
+    net, opt, seeds = make_net(args, env), optax.scale_by_adam(), one_for_each_seed(args)
+    states = [init_state(a, env, net, opt) for a in seeds]  # before a folder is touched: the checkpoint may be refused
+    outs = records.start_runs(seeds, env.config)
     print(f"{args.task}: observation {env.obs_dim}, action {env.action_dim}, engine {type(env.engine).__name__}")
     print("  ".join(f"{name}={value}" for name, value in dataclasses.asdict(args).items()), flush=True)
     if args.network == "pidm":
-        describe(args, state.params)
-
-    @jax.jit
-    def train_chunk(state):
-        return jax.lax.scan(lambda s, _: iteration(args, env, net, opt, s), state, None, args.log_every)
+        describe(args, states[0].params)
+    states = jax.tree.map(lambda *leaves: jnp.stack(leaves), *states)
 
     iterations = -(-args.total_steps // (args.num_envs * args.num_steps))
     start = time.perf_counter()
-    chunk = train_chunk.lower(state).compile()
+    chunk = make_chunk(args, env, net, opt).lower(states).compile()
     print(f"compiled in {time.perf_counter() - start:.1f} s", flush=True)
     start = last = time.perf_counter()
-    rows = []
+    rows = [[] for _ in seeds]
     with records.Reporter(iterations, SHOWN) as reporter:
-        while int(state.iteration) < iterations and not reporter.stopped:
-            state, metrics = chunk(state)
-            metrics = jax.device_get(metrics)
+        while int(states.iteration[0]) < iterations and not reporter.stopped:
+            states, metrics = chunk(states)
             now = time.perf_counter()
-            row = records.make_row(args, int(state.iteration), now - start, metrics)
-            rows.append(row)
-            records.save_rows(out / "metrics.csv", rows)
-            reporter.show(row, args.log_every * args.num_envs * args.num_steps / (now - last))
+            keep(seeds, outs, states, jax.device_get(metrics), rows, now - start)
+            speed = args.num_seeds * args.log_every * args.num_envs * args.num_steps / (now - last)
+            reporter.show(records.mean_row([own[-1] for own in rows]), speed)
             last = now
-            if not all(jnp.isfinite(x).all() for x in jax.tree.leaves(state.params)):
-                raise records.UserError(f"weights are not finite after iteration {row['iteration']}; lower --lr")
-            records.save(out / "policy.msgpack", state.params, {"task": args.task, "args": dataclasses.asdict(args)})
     if reporter.stopped:
         print("interrupted")
-    plot(rows, out / "curve.png")
-    print(f"wrote {out}/policy.msgpack, metrics.csv, curve.png")
-    return state
+    for out, own in zip(outs, rows, strict=True):
+        plot(own, out / "curve.png")
+        print(f"wrote {out}/policy.msgpack, metrics.csv, curve.png")
+    return states
+
+
+def keep(seeds, outs, states, metrics, rows, seconds):
+    """A chunk is done: add a row to each seed's metrics.csv, and replace its policy if its weights are sound."""
+    for i, (args, out) in enumerate(zip(seeds, outs, strict=True)):
+        params, own = jax.tree.map(lambda x, i=i: x[i], (states.params, metrics))
+        rows[i].append(records.make_row(args, int(states.iteration[i]), seconds, own))
+        records.save_rows(out / "metrics.csv", rows[i])
+        if not all(jnp.isfinite(x).all() for x in jax.tree.leaves(params)):
+            raise records.UserError(f"weights are not finite after iteration {states.iteration[i]}; lower --lr")
+        records.save(out / "policy.msgpack", params, {"task": args.task, "args": dataclasses.asdict(args)})
 
 
 def main(args):

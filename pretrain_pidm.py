@@ -437,7 +437,7 @@ def pretrain(args):
     if not 1 <= count <= len(dataset.train):
         raise records.UserError(f"--num-samples {count} is not within 1 and the {len(dataset.train)} in {args.data}")
     order = np.random.default_rng(args.seed).permutation(dataset.train)[:count]
-    out = records.start_run(args, env.config, args.run_dir, args.force)
+    out = records.start_run(args, env.config)
     print(f"{robot}: {count} transitions to train on, {len(dataset.validation)} to validate")
     print("  ".join(f"{name}={value}" for name, value in dataclasses.asdict(args).items()), flush=True)
 

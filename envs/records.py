@@ -68,14 +68,26 @@ def check_minibatches(args):
         )
 
 
-def start_run(args, config, folder, force):
-    """Create the run folder with args.json in it and return it. Refuses to overwrite a run unless `force`.
+def start_runs(each, config):
+    """Create the folder of each of these arguments and return them. UserError, and nothing touched, if one is taken."""
+    for args in each:
+        refuse_overwrite(Path(args.run_dir), args.force)
+    return [start_run(args, config) for args in each]
+
+
+def refuse_overwrite(out, force):
+    """UserError if the folder holds a run, unless `force`."""
+    if (out / "metrics.csv").exists() and not force:
+        raise UserError(f"{out} holds a run already; pass --force to overwrite it or --run-dir for another folder")
+
+
+def start_run(args, config):
+    """Create the folder args.run_dir with args.json in it and return it. Refuses to overwrite a run unless args.force.
 
     args and config (the task's) are dataclasses; both are recorded, with versions, commit and device.
     """
-    out = Path(folder)
-    if (out / "metrics.csv").exists() and not force:
-        raise UserError(f"{out} holds a run already; pass --force to overwrite it or --run-dir for another folder")
+    out = Path(args.run_dir)
+    refuse_overwrite(out, args.force)
     record = dataclasses.asdict(args) | {"config": dataclasses.asdict(config), "versions": versions()}
     try:
         out.mkdir(parents=True, exist_ok=True)
@@ -149,6 +161,11 @@ def make_row(args, iterations, seconds, metrics):
     steps = args.num_envs * args.num_steps
     row = {"iteration": iterations, "env_steps": iterations * steps, "seconds": seconds, **ended, **metrics}
     return {name: float(f"{float(value):.6g}") for name, value in row.items()}
+
+
+def mean_row(rows):
+    """Mean of several rows, column by column."""
+    return {name: sum(row[name] for row in rows) / len(rows) for name in rows[0]}
 
 
 def pyplot():

@@ -266,7 +266,7 @@ def test_normalizer_is_not_trained(pretrained, tmp_path):
     path = pretrained / "pidm.msgpack"
     state = finetune.main(finetune.Args(preset="smoke", pretrained=str(path), run_dir=str(tmp_path / "run")))
     pidm, _ = records.load(path, "PIDM checkpoint")
-    np.testing.assert_array_equal(state.params["normalizer"]["prop_std"], pidm["normalizer"]["prop_std"])
+    np.testing.assert_array_equal(state.params["normalizer"]["prop_std"][0], pidm["normalizer"]["prop_std"])
     backbone = state.params["params"]["actor"]["backbone"]["Dense_0"]["kernel"]
     assert np.abs(backbone - pidm["params"]["backbone"]["Dense_0"]["kernel"]).max() > 0
 

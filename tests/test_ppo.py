@@ -228,7 +228,7 @@ def test_update_visits_every_sample_once_an_epoch(monkeypatch):
     roll = jax.tree.map(lambda _: jnp.arange(12).reshape(3, 4), batch())
     params = {"params": {"actor": jnp.float32(0), "critic": jnp.float32(0), "log_std": jnp.float32(0)}}
     opt = optax.scale_by_adam()
-    state = script.TrainState(params, opt.init(params), jnp.float32(1e-3), None, 0)
+    state = script.TrainState(params, opt.init(params), jnp.float32(1e-3), None, None, 0)
     zeros = jnp.zeros((3, 4))
     *_, metrics = script.update(args, None, None, opt, state, roll, zeros, zeros, jax.random.key(0))
     np.testing.assert_array_equal(metrics["seen"], 3 * np.ones(12))

@@ -47,17 +47,31 @@ def test_run_folder(trained):
     assert (out / "curve.png").stat().st_size > 5000
     params, meta = records.load(out / "policy.msgpack", "policy")
     assert meta["task"] == "g1_loco"
-    jax.tree.map(np.testing.assert_array_equal, params, jax.device_get(state.params))
+    jax.tree.map(lambda a, b: np.testing.assert_array_equal(a, b[0]), params, jax.device_get(state.params))
     assert not list(out.glob("*.tmp"))
 
 
 def test_same_seed_same_weights(trained, tmp_path):
-    again = script.main(dataclasses.replace(SMOKE, task="g1_loco", run_dir=str(tmp_path / "b")))
-    other = script.main(dataclasses.replace(SMOKE, task="g1_loco", seed=1, run_dir=str(tmp_path / "c")))
-    jax.tree.map(np.testing.assert_array_equal, trained[1].params, again.params)
-    kernel = ("params", "actor", "Dense_0", "kernel")
-    weights = [s.params[kernel[0]][kernel[1]][kernel[2]][kernel[3]] for s in (again, other)]
-    assert not np.array_equal(*weights)
+    """Two seeds in one program end with the bits of the same seeds alone, and with different weights."""
+    both = script.main(dataclasses.replace(SMOKE, task="g1_loco", num_seeds=2, run_dir=str(tmp_path / "both")))
+    alone = script.main(dataclasses.replace(SMOKE, task="g1_loco", seed=1, run_dir=str(tmp_path / "b")))
+    for i, one in enumerate((trained[1], alone)):
+        jax.tree.map(lambda a, b, i=i: np.testing.assert_array_equal(a[i], b[0]), both.params, one.params)
+        params, meta = records.load(tmp_path / f"both/seed{i}/policy.msgpack", "policy")
+        jax.tree.map(lambda a, b, i=i: np.testing.assert_array_equal(a, b[0]), params, jax.device_get(one.params))
+        assert meta["args"]["seed"] == i
+    rows = [(path / "metrics.csv").read_text() for path in (trained[0], tmp_path / "both/seed0")]
+    first, second = ([line.split(",")[:2] + line.split(",")[3:] for line in text.splitlines()] for text in rows)
+    assert first == second  # but for the seconds
+    kernels = both.params["params"]["actor"]["Dense_0"]["kernel"]
+    assert not np.array_equal(*kernels)
+
+
+def test_seeds_whose_folder_is_taken_are_refused_together(trained, tmp_path, refused):
+    (tmp_path / "seed1").mkdir()
+    (tmp_path / "seed1/metrics.csv").write_text("old\n")
+    refused(script.main, dataclasses.replace(SMOKE, num_seeds=2, run_dir=str(tmp_path)), "seed1 holds a run already")
+    assert [path.name for path in tmp_path.iterdir()] == ["seed1"]
 
 
 def test_one_compile(jitted):
