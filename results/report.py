@@ -5,9 +5,9 @@
     python results/report.py --beside runs/demo
 
 Metrics are the paper's: final performance (mean return of the last 5% of rows) and iterations to 90% of the final
-performance of PIDM random, both against PIDM random; beside them the area under the curve and the mean action's
-velocity error. Intervals are 95% bootstrap intervals over seeds. --check fails if the README is not what runs give;
---beside draws a run of yours with the recorded ones of its task.
+performance of PIDM random, both against PIDM random; beside them iterations to 50%, area under the curve, and return
+and velocity error of the mean action. Intervals are 95% bootstrap intervals over seeds. --check fails if the README is
+not what the runs give; --beside draws a run of yours with the recorded ones of its task.
 """
 
 import csv
@@ -130,35 +130,51 @@ def table(task, runs):
     baseline = runs.get("pidm_random")
     if not baseline:
         return ["PIDM random was not run, so there is nothing to compare with."]
-    level = 0.9 * np.mean([final(run) for run in baseline])
-    reached = [iterations_to(run, level) for run in baseline]
-    lines = [
-        "| method | seeds | final return | % of random | iterations to 90% | % of random | area, % of random "
-        "| mean action: return | velocity error [m/s] | falls | minutes | paper: final %, iterations % |",
-        "|---|---|---|---|---|---|---|---|---|---|---|---|",
-    ]
+    goal = np.mean([final(run) for run in baseline])
+    measures = {
+        "final": final,
+        "to 90%": lambda run: iterations_to(run, 0.9 * goal),
+        "to 50%": lambda run: iterations_to(run, 0.5 * goal),
+        "area": area,
+    }
+    rows = []
     for method, title in METHODS.items():
         if method not in runs:
             continue
-        mine, own = runs[method], method == "pidm_random"
-        finals, counts = [final(run) for run in mine], [iterations_to(run, level) for run in mine]
+        mine = runs[method]
+        values = {name: [measure(run) for run in mine] for name, measure in measures.items()}
+        percent = {
+            name: against_random(values[name], [measure(run) for run in baseline], method == "pidm_random")
+            for name, measure in measures.items()
+        }
+        mean = {name: np.mean([run["errors"][name] for run in mine]) for name in mine[0]["errors"]}
         paper = PAPER.get(method, {}).get(task)
-        cells = [
-            title,
-            ", ".join(str(run["seed"]) for run in mine),
-            f"{np.mean(finals):.2f} ± {np.std(finals):.2f}",
-            against_random(finals, [final(run) for run in baseline], own),
-            "not reached" if np.isnan(counts).all() else f"{np.nanmean(counts):.0f}",
-            against_random(counts, reached, own),
-            against_random([area(run) for run in mine], [area(run) for run in baseline], own),
-            f"{np.mean([run['errors']['episode_return'] for run in mine]):.2f}",
-            f"{np.mean([run['errors']['lin_vel_error'] for run in mine]):.3f}",
-            f"{100 * np.mean([run['errors']['falls'] for run in mine]):.0f}%",
-            f"{np.mean([run['seconds'] for run in mine]) / 60:.1f}",
-            f"{paper[0]:+.1f}, {paper[1]:+.1f}" if paper else "",
-        ]
-        lines.append("| " + " | ".join(cells) + " |")
-    return lines
+        rows.append(
+            {
+                "method": title,
+                "seeds": ", ".join(str(run["seed"]) for run in mine),
+                "final return": f"{np.mean(values['final']):.2f} ± {np.std(values['final']):.2f}",
+                "% of random": percent["final"],
+                "paper": f"{paper[0]:+.1f}" if paper else "",
+                "iterations to 90%": cell_of_counts(values["to 90%"]),
+                "% of random ": percent["to 90%"],
+                "paper ": f"{paper[1]:+.1f}" if paper else "",
+                "iterations to 50%": cell_of_counts(values["to 50%"]),
+                "% of random  ": percent["to 50%"],
+                "area, % of random": percent["area"],
+                "mean action: return": f"{mean['episode_return']:.2f}",
+                "velocity error [m/s]": f"{mean['lin_vel_error']:.3f}",
+                "falls": f"{100 * mean['falls']:.0f}%",
+                "minutes": f"{np.mean([run['seconds'] for run in mine]) / 60:.1f}",
+            }
+        )
+    lines = [list(rows[0]), ["---"] * len(rows[0]), *(row.values() for row in rows)]
+    return ["| " + " | ".join(cell.strip() for cell in line) + " |" for line in lines]
+
+
+def cell_of_counts(counts):
+    """Mean of iteration counts, NaN where a level was not reached."""
+    return "not reached" if np.isnan(counts).all() else f"{np.nanmean(counts):.0f}"
 
 
 def draw(tasks, path, extra=None):
