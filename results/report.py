@@ -37,6 +37,7 @@ PAPER = {  # Table I: method -> task -> (final performance, iterations to 90 %),
     "mlp": {"go1_loco": (0.6, 2.2), "anymal_loco": (0.5, -28.7), "g1_loco": (-0.2, -46.7)},
     "pidm_pretrained": {"go1_loco": (3.6, -17.7), "anymal_loco": (10.1, -33.1), "g1_loco": (10.0, -34.0)},
 }
+COLUMNS = ("iteration", "seconds", "episode_return", "lr", "action_std")  # of metrics.csv
 
 
 @dataclass(frozen=True)
@@ -52,19 +53,21 @@ def load_run(folder):
         result = json.loads((folder / "eval.json").read_text())
         with (folder / "metrics.csv").open() as file:
             rows = list(csv.DictReader(file))
-        curve = np.array([[float(row["iteration"]), float(row["episode_return"])] for row in rows])
+        columns = {name: np.array([float(row[name]) for row in rows]) for name in COLUMNS}
     except (OSError, ValueError, KeyError, TypeError) as error:
         print(f"warning: {folder.relative_to(ROOT)} left out: {error}", file=sys.stderr)
         return None
     steps = record["num_envs"] * record["num_steps"]
-    if curve[-1, 0] * steps < record["total_steps"]:
+    if columns["iteration"][-1] * steps < record["total_steps"]:
         print(f"warning: {folder.relative_to(ROOT)} left out: stopped before its last step", file=sys.stderr)
         return None
     keys = ("num_envs", "num_steps", "total_steps", "lr", "num_epochs", "mirror_coef", "config")
     return {
-        "iteration": curve[:, 0],
-        "return": curve[:, 1],
-        "seconds": float(rows[-1]["seconds"]),
+        "iteration": columns["iteration"],
+        "return": columns["episode_return"],
+        "lr": columns["lr"],
+        "action_std": columns["action_std"],
+        "seconds": columns["seconds"][-1],
         "errors": result["task"],
         "settings": {key: record[key] for key in keys},
         "seed": record["seed"],
@@ -168,8 +171,29 @@ def table(task, runs):
                 "minutes": f"{np.mean([run['seconds'] for run in mine]) / 60:.1f}",
             }
         )
+    return markdown(rows)
+
+
+def markdown(rows):
+    """Lines of a table from rows, dicts of the same columns. Trailing blanks tell columns of one title apart."""
     lines = [list(rows[0]), ["---"] * len(rows[0]), *(row.values() for row in rows)]
     return ["| " + " | ".join(cell.strip() for cell in line) + " |" for line in lines]
+
+
+def noise_table(runs):
+    """Markdown lines: how the KL-controlled step size and the action std went, which the noisy return hangs on."""
+    rows = []
+    for method, mine in runs.items():
+        shrink = [np.log(run["action_std"][-1] / run["action_std"][0]) / run["lr"].sum() for run in mine]
+        rows.append(
+            {
+                "method": METHODS[method],
+                "mean step size": f"{np.mean([run['lr'].mean() for run in mine]):.3g}",
+                "final action std": f"{np.mean([run['action_std'][-1] for run in mine]):.3f}",
+                "change of log std over summed step sizes": f"{np.mean(shrink):.0f}",
+            }
+        )
+    return markdown(rows)
 
 
 def cell_of_counts(counts):
@@ -207,7 +231,7 @@ def report(scale):
         lines += [
             f"{s['num_envs']} x {s['num_steps']}, {s['total_steps'] / 1e6:.1f} M steps, engine `c`, {v['machine']}."
         ]
-        lines += ["", *table(task, runs), ""]
+        lines += ["", *table(task, runs), "", *noise_table(runs), ""]
     return lines, tasks
 
 

@@ -51,8 +51,9 @@ def study(tmp_path, monkeypatch):
         (folder / "args.json").write_text(json.dumps(args))
         task = {"episode_return": 9.0, "lin_vel_error": 0.1, "falls": 0.0}
         (folder / "eval.json").write_text(json.dumps({"task": task}))
-        rows = [f"{i},{10 * i},{i},{2.0 * i}" for i in range(1, 5)]
-        (folder / "metrics.csv").write_text("\n".join(["iteration,env_steps,seconds,episode_return", *rows]) + "\n")
+        rows = [f"{i},{10 * i},{i},0.1,0.5,{2.0 * i}" for i in range(1, 5)]
+        names = "iteration,env_steps,seconds,lr,action_std,episode_return"
+        (folder / "metrics.csv").write_text("\n".join([names, *rows]) + "\n")
     return tmp_path, args
 
 
