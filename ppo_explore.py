@@ -28,7 +28,7 @@ import optax
 import tyro
 
 import envs
-from envs import records
+from envs import devices, records
 
 jax.config.update("jax_default_matmul_precision", "highest")  # TF32 of recent GPUs changes what is learned
 
@@ -73,6 +73,9 @@ class Args:
     entropy_coef: float | None = None
     mirror_coef: float = 0.1
     max_grad_norm: float = 1.0
+    # --- Devices ---
+    distributed: bool = False  # one of several processes, one a host; process 0 writes the files
+    shuffle_blocks: int | None = None  # blocks of environments that samples are shuffled within; None: one a device
 
 
 PRESETS = {
@@ -96,6 +99,7 @@ def merge(args, ppo):
     values = PRESETS[args.preset] | {"hidden": ppo["hidden"], "init_std": ppo["init_std"]}
     values |= {"entropy_coef": ppo["entropy"], "run_dir": f"runs/explore/{args.robot}/seed{args.seed}"}
     args = dataclasses.replace(args, **{name: v for name, v in values.items() if getattr(args, name) is None})
+    args = dataclasses.replace(args, shuffle_blocks=args.shuffle_blocks or jax.device_count())
     records.check_positive(args, COUNTS)
     if not 0 < args.validation < 1 or num_held_out(args) == args.num_envs:
         raise records.UserError(
@@ -421,7 +425,7 @@ def mirror_loss(env, net, params, inputs, mean, key):
     The target carries no gradient (Mittal et al. 2024). mean (B, A). A quarter of the minibatch, which is shuffled
     already, gives the same expectation for a quarter of the work.
     """
-    inputs, mean = jax.tree.map(lambda x: x[: -(-len(x) // 4)], (inputs, mean))
+    inputs, mean = jax.tree.map(lambda x: x[::4], (inputs, mean))
     which = jax.random.randint(key, (), 0, len(env.mirrors))
     table = jax.tree.map(lambda *tables: jnp.stack(tables)[which], *env.mirrors.values())
     mirrored = {name: x[..., table[name][0]] * table[name][1] for name, x in inputs.items()}
@@ -461,10 +465,26 @@ def clip_gradients(args, grads):
     return grads | {"params": parts[0] | parts[1]}, jnp.stack(norms)
 
 
+def minibatches(args, key, samples):
+    """Arrays (T, N, ...) -> (M, B, ...): M minibatches, samples shuffled within blocks of environments.
+
+    Every minibatch takes as much of each block, so that a device which holds a block need not send samples about.
+    """
+    blocks, size = args.shuffle_blocks, args.num_envs * args.num_steps
+    perm = jax.vmap(lambda k: jax.random.permutation(k, size // blocks))(jax.random.split(key, blocks))
+
+    def arrange(x):
+        x = jnp.moveaxis(x.reshape(args.num_steps, blocks, -1, *x.shape[2:]), 1, 0)  # (blocks, T, N / blocks, ...)
+        x = jax.vmap(lambda block, p: block[p])(x.reshape(blocks, -1, *x.shape[3:]), perm)
+        x = jnp.moveaxis(x.reshape(blocks, args.num_minibatches, -1, *x.shape[2:]), 1, 0)
+        return x.reshape(args.num_minibatches, -1, *x.shape[3:])
+
+    return jax.tree.map(arrange, samples)
+
+
 def update(args, env, net, opt, state, roll, advantage, ret, key):
     """E epochs of minibatch steps on one rollout. Returns params, opt_state, lr and mean metrics."""
     advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
-    flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), (roll, advantage, ret))  # (T * N, ...)
     log_std_old = state.params["params"]["log_std"]
 
     def minibatch(carry, inputs):
@@ -481,8 +501,7 @@ def update(args, env, net, opt, state, roll, advantage, ret, key):
 
     def epoch(carry, key):
         k_perm, k_mirror = jax.random.split(key)
-        perm = jax.random.permutation(k_perm, args.num_envs * args.num_steps)
-        batches = jax.tree.map(lambda x: x[perm].reshape(args.num_minibatches, -1, *x.shape[1:]), flat)
+        batches = minibatches(args, k_perm, (roll, advantage, ret))
         return jax.lax.scan(minibatch, carry, (batches, jax.random.split(k_mirror, args.num_minibatches)))
 
     carry = state.params, state.opt_state, state.lr
@@ -610,7 +629,9 @@ SHOWN = ("disagreement", "ensemble_error", "fall_rate", "kl", "action_std")  # i
 def make_env(args):
     """The robot's exploration environment, or a UserError that lists the right names."""
     try:
-        return envs.make_explore(args.robot, args.engine)
+        env = envs.make_explore(args.robot, args.engine)
+        devices.check_engine(env.engine)
+        return env
     except (ValueError, ImportError) as error:
         raise records.UserError(str(error)) from None
 
@@ -621,16 +642,18 @@ def explore(args):
     args = merge(args, env.config.ppo)
     chunks = -(-args.total_steps // (args.num_envs * args.num_steps * args.log_every))
     iterations = chunks * args.log_every
-    out = records.start_run(args, env.config)
-    files = create_files(out, args, env, iterations)
+    out = records.start_run(args, env.config, args.run_dir, args.force) if devices.is_first() else None
+    files = create_files(out, args, env, iterations) if out else {}
     print(f"{args.robot}: x {env.prop_dim}, action {env.action_dim}, engine {type(env.engine).__name__}")
     print("  ".join(f"{name}={value}" for name, value in dataclasses.asdict(args).items()), flush=True)
     net = ActorCritic(args.hidden, env.action_dim, args.init_std)
     member = PIDM(MEMBER, 2 * env.action_dim)
     opt, member_opt = optax.scale_by_adam(), optax.adam(args.ensemble_lr)
     state = init_state(args, env, net, opt, member, member_opt)
+    shardings = devices.of_state(state, axis=0)
+    state = devices.place(state, shardings)
 
-    @partial(jax.jit, donate_argnums=0)
+    @partial(jax.jit, donate_argnums=0, out_shardings=(shardings, devices.same()))
     def collect_chunk(state):
         step = partial(iteration, args, env, net, opt, member, member_opt)
         return jax.lax.scan(lambda s, _: step(s), state, None, args.log_every)
@@ -649,7 +672,8 @@ def explore(args):
             now = time.perf_counter()
             row = records.make_row(args, int(state.iteration), now - start, jax.device_get(metrics))
             rows.append(row)
-            records.save_rows(out / "metrics.csv", rows)
+            if out:
+                records.save_rows(out / "metrics.csv", rows)
             reporter.show(row, args.log_every * args.num_envs * args.num_steps / (now - last))
             last = now
             if not np.isfinite(row["disagreement"]):
@@ -657,12 +681,18 @@ def explore(args):
     if reporter.stopped:
         print(f"interrupted: {out} is an unfinished collection; start it again with --force")
         return None
+    if out:
+        finish(out, args, env, iterations, files, rows)
+    return state
+
+
+def finish(out, args, env, iterations, files, rows):
+    """The dataset is full: flush its arrays, write meta.json last, draw the curves."""
     for file in files.values():
         file.flush()
     write_meta(out, args, env, iterations)
     plot(rows, out / "curve.png")
     print(f"wrote {iterations * args.num_envs * args.num_steps} transitions to {out}")
-    return state
 
 
 def plot(rows, path):
@@ -675,6 +705,7 @@ def plot(rows, path):
 def main(args):
     """Collect data. UserErrors end in one line and exit code 2."""
     try:
+        devices.join(args.distributed)
         return explore(args)
     except records.UserError as error:
         print(f"error: {error}", file=sys.stderr)

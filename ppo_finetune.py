@@ -27,7 +27,7 @@ import optax
 import tyro
 
 import envs
-from envs import records
+from envs import devices, records
 
 SHIPPED = Path(__file__).parent / "assets/pidm"  # <robot>.msgpack: pretrained weights and input scaling
 jax.config.update("jax_default_matmul_precision", "highest")  # TF32 of recent GPUs changes what is learned
@@ -72,6 +72,9 @@ class Args:
     entropy_coef: float | None = None  # weight of the entropy bonus
     mirror_coef: float = 0.1  # weight of the mirror loss; ours, the paper gives no number
     max_grad_norm: float = 1.0  # of actor and critic, each
+    # --- Devices ---
+    distributed: bool = False  # one of several processes, one a host; process 0 writes the files
+    shuffle_blocks: int | None = None  # blocks of environments that samples are shuffled within; None: one a device
 
 
 PRESETS = {
@@ -106,6 +109,7 @@ def merge(args, ppo):
     folder = f"runs/{args.task}/{method_name(args)}"
     values |= {"run_dir": folder if args.num_seeds > 1 else f"{folder}/seed{args.seed}"}
     args = dataclasses.replace(args, **{name: v for name, v in values.items() if getattr(args, name) is None})
+    args = dataclasses.replace(args, shuffle_blocks=args.shuffle_blocks or jax.device_count())
     records.check_positive(args, COUNTS)
     records.check_minibatches(args)
     return args
@@ -459,7 +463,7 @@ def mirror_loss(env, net, params, inputs, mean, key):
     The target carries no gradient (Mittal et al. 2024). mean (B, A). A quarter of the minibatch, which is shuffled
     already, gives the same expectation for a quarter of the work.
     """
-    inputs, mean = jax.tree.map(lambda x: x[: -(-len(x) // 4)], (inputs, mean))
+    inputs, mean = jax.tree.map(lambda x: x[::4], (inputs, mean))
     which = jax.random.randint(key, (), 0, len(env.mirrors))
     table = jax.tree.map(lambda *tables: jnp.stack(tables)[which], *env.mirrors.values())
     mirrored = {name: x[..., table[name][0]] * table[name][1] for name, x in inputs.items()}
@@ -499,10 +503,26 @@ def clip_gradients(args, grads):
     return grads | {"params": parts[0] | parts[1]}, jnp.stack(norms)
 
 
+def minibatches(args, key, samples):
+    """Arrays (T, N, ...) -> (M, B, ...): M minibatches, samples shuffled within blocks of environments.
+
+    Every minibatch takes as much of each block, so that a device which holds a block need not send samples about.
+    """
+    blocks, size = args.shuffle_blocks, args.num_envs * args.num_steps
+    perm = jax.vmap(lambda k: jax.random.permutation(k, size // blocks))(jax.random.split(key, blocks))
+
+    def arrange(x):
+        x = jnp.moveaxis(x.reshape(args.num_steps, blocks, -1, *x.shape[2:]), 1, 0)  # (blocks, T, N / blocks, ...)
+        x = jax.vmap(lambda block, p: block[p])(x.reshape(blocks, -1, *x.shape[3:]), perm)
+        x = jnp.moveaxis(x.reshape(blocks, args.num_minibatches, -1, *x.shape[2:]), 1, 0)
+        return x.reshape(args.num_minibatches, -1, *x.shape[3:])
+
+    return jax.tree.map(arrange, samples)
+
+
 def update(args, env, net, opt, state, roll, advantage, ret, key):
     """E epochs of minibatch steps on one rollout. Returns params, opt_state, lr and mean metrics."""
     advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
-    flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), (roll, advantage, ret))  # (T * N, ...)
     log_std_old = state.params["params"]["log_std"]
 
     def minibatch(carry, inputs):
@@ -519,8 +539,7 @@ def update(args, env, net, opt, state, roll, advantage, ret, key):
 
     def epoch(carry, key):
         k_perm, k_mirror = jax.random.split(key)
-        perm = jax.random.permutation(k_perm, args.num_envs * args.num_steps)
-        batches = jax.tree.map(lambda x: x[perm].reshape(args.num_minibatches, -1, *x.shape[1:]), flat)
+        batches = minibatches(args, k_perm, (roll, advantage, ret))
         return jax.lax.scan(minibatch, carry, (batches, jax.random.split(k_mirror, args.num_minibatches)))
 
     carry = state.params, state.opt_state, state.lr
@@ -576,7 +595,7 @@ def one_for_each_seed(args):
     return [dataclasses.replace(args, seed=s, run_dir=f) for s, f in zip(seeds, folders, strict=True)]
 
 
-def make_chunk(args, env, net, opt):
+def make_chunk(args, env, net, opt, states):
     """log_every iterations of all seeds' TrainStates (S, ...), which also returns their metrics (S, log_every)."""
 
     def one_seed(state):
@@ -584,7 +603,11 @@ def make_chunk(args, env, net, opt):
 
     # one after the other on a CPU, which a single seed fills; side by side on an accelerator
     in_turn = jax.default_backend() == "cpu"
-    return jax.jit(lambda states: jax.lax.map(one_seed, states) if in_turn else jax.vmap(one_seed)(states))
+
+    def all_seeds(states):
+        return jax.lax.map(one_seed, states) if in_turn else jax.vmap(one_seed)(states)
+
+    return jax.jit(all_seeds, out_shardings=(devices.of_state(states, axis=1), devices.same()))
 
 
 # --- Evaluation ---
@@ -665,7 +688,9 @@ def showcase(args):
 def make_env(args, **overrides):
     """The task's environment, or a UserError that lists the right names."""
     try:
-        return envs.make(args.task, args.engine, **overrides)
+        env = envs.make(args.task, args.engine, **overrides)
+        devices.check_engine(env.engine)
+        return env
     except (ValueError, ImportError) as error:
         raise records.UserError(str(error)) from None
 
@@ -690,16 +715,17 @@ def train(args):
     args = merge(args, env.config.ppo)
     net, opt, seeds = make_net(args, env), optax.scale_by_adam(), one_for_each_seed(args)
     states = [init_state(a, env, net, opt) for a in seeds]  # before a folder is touched: the checkpoint may be refused
-    outs = records.start_runs(seeds, env.config)
+    outs = records.start_runs(seeds, env.config, args.force) if devices.is_first() else [None] * len(seeds)
     print(f"{args.task}: observation {env.obs_dim}, action {env.action_dim}, engine {type(env.engine).__name__}")
     print("  ".join(f"{name}={value}" for name, value in dataclasses.asdict(args).items()), flush=True)
     if args.network == "pidm":
         describe(args, states[0].params)
     states = jax.tree.map(lambda *leaves: jnp.stack(leaves), *states)
+    states = devices.place(states, devices.of_state(states, axis=1))
 
     iterations = -(-args.total_steps // (args.num_envs * args.num_steps))
     start = time.perf_counter()
-    chunk = make_chunk(args, env, net, opt).lower(states).compile()
+    chunk = make_chunk(args, env, net, opt, states).lower(states).compile()
     print(f"compiled in {time.perf_counter() - start:.1f} s", flush=True)
     start = last = time.perf_counter()
     rows = [[] for _ in seeds]
@@ -713,26 +739,32 @@ def train(args):
             last = now
     if reporter.stopped:
         print("interrupted")
-    for out, own in zip(outs, rows, strict=True):
+    for out, own in zip(outs, rows, strict=True) if devices.is_first() else ():
         plot(own, out / "curve.png")
         print(f"wrote {out}/policy.msgpack, metrics.csv, curve.png")
     return states
 
 
 def keep(seeds, outs, states, metrics, rows, seconds):
-    """A chunk is done: add a row to each seed's metrics.csv, and replace its policy if its weights are sound."""
+    """A chunk is done: add a row to each seed's metrics.csv, and replace its policy if its weights are sound.
+
+    On hosts other than the first, whose `outs` are None, rows are made but not written.
+    """
     for i, (args, out) in enumerate(zip(seeds, outs, strict=True)):
         params, own = jax.tree.map(lambda x, i=i: x[i], (states.params, metrics))
         rows[i].append(records.make_row(args, int(states.iteration[i]), seconds, own))
-        records.save_rows(out / "metrics.csv", rows[i])
+        if out:
+            records.save_rows(out / "metrics.csv", rows[i])
         if not all(jnp.isfinite(x).all() for x in jax.tree.leaves(params)):
             raise records.UserError(f"weights are not finite after iteration {states.iteration[i]}; lower --lr")
-        records.save(out / "policy.msgpack", params, {"task": args.task, "args": dataclasses.asdict(args)})
+        if out:
+            records.save(out / "policy.msgpack", params, {"task": args.task, "args": dataclasses.asdict(args)})
 
 
 def main(args):
     """Train, or evaluate with --eval. UserErrors end in one line and exit code 2."""
     try:
+        devices.join(args.distributed)
         return run_eval(args) if args.eval else train(args)
     except records.UserError as error:
         print(f"error: {error}", file=sys.stderr)

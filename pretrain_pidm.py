@@ -13,6 +13,7 @@ import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -24,7 +25,7 @@ import optax
 import tyro
 
 import envs
-from envs import records
+from envs import devices, records
 from envs.base import NOISE
 
 jax.config.update("jax_default_matmul_precision", "highest")  # TF32 of recent GPUs changes what is learned
@@ -40,6 +41,7 @@ class Args:
     seed: int = 0  # the only source of randomness
     run_dir: str | None = None  # None: runs/pidm/<robot>/seed<seed>
     force: bool = False  # overwrite the run in that folder
+    distributed: bool = False  # one of several processes, one a host; process 0 writes the files
     # --- Data ---
     num_samples: int | None = None  # train on this many transitions, drawn at random; None: all (paper: 7 M)
     noise: float = 1.0  # multiplies the tasks' sensor noise
@@ -62,6 +64,8 @@ def merge(args, robot):
     values = PRESETS[args.preset] | {"run_dir": f"runs/pidm/{robot}/seed{args.seed}"}
     args = dataclasses.replace(args, **{name: v for name, v in values.items() if getattr(args, name) is None})
     records.check_positive(args, ("epochs", "batch"))
+    if args.batch % jax.device_count():
+        raise records.UserError(f"--batch {args.batch} cannot be split over {jax.device_count()} devices")
     return args
 
 
@@ -309,7 +313,7 @@ def l1_loss(net, variables, batch):
 def make_step(args, env, net, opt):
     """One Adam step on an augmented batch, compiled."""
 
-    @jax.jit
+    @partial(jax.jit, out_shardings=devices.same())
     def step(variables, opt_state, batch, key):
         batch = augment(args, env, key, batch)
         loss, grads = jax.value_and_grad(lambda p: l1_loss(net, variables | {"params": p}, batch))(variables["params"])
@@ -323,9 +327,11 @@ def run_epoch(args, dataset, index, step, carry, epoch):
     """One pass over the training transitions in an order that (seed, epoch) alone decides. Mean loss."""
     variables, opt_state = carry
     order = np.random.default_rng((args.seed, epoch)).permutation(index)
-    whole = max(len(order) - len(order) % args.batch, min(len(order), args.batch))  # no ragged last batch
+    size = min(args.batch, len(order) // jax.device_count() * jax.device_count())
+    whole = len(order) - len(order) % size  # no ragged last batch
     losses = []
-    for number, batch in enumerate(batches(dataset, order[:whole], args.batch)):
+    for number, batch in enumerate(batches(dataset, order[:whole], size)):
+        batch = devices.place(batch, dict.fromkeys(batch, devices.split(0)))
         key = jax.random.fold_in(jax.random.fold_in(jax.random.key(args.seed), epoch), number)
         variables, opt_state, loss = step(variables, opt_state, batch, key)
         losses.append(loss)
@@ -437,7 +443,7 @@ def pretrain(args):
     if not 1 <= count <= len(dataset.train):
         raise records.UserError(f"--num-samples {count} is not within 1 and the {len(dataset.train)} in {args.data}")
     order = np.random.default_rng(args.seed).permutation(dataset.train)[:count]
-    out = records.start_run(args, env.config)
+    out = records.start_run(args, env.config, args.run_dir, args.force) if devices.is_first() else None
     print(f"{robot}: {count} transitions to train on, {len(dataset.validation)} to validate")
     print("  ".join(f"{name}={value}" for name, value in dataclasses.asdict(args).items()), flush=True)
 
@@ -448,9 +454,11 @@ def pretrain(args):
     variables = net.init(k_init, jnp.zeros(history), jnp.zeros(env.prop_dim)) | {"normalizer": norm}
     opt = optax.adam(optax.cosine_decay_schedule(args.lr, args.epochs * max(count // args.batch, 1)))
     step, carry = make_step(args, env, net, opt), (variables, opt.init(variables["params"]))
+    carry = devices.place(carry, jax.tree.map(lambda _: devices.same(), carry))
 
     rows = run_epochs(args, env, net, dataset, order, step, carry, out)
-    report(args, env, net, dataset, rows, out)
+    if out:
+        report(args, env, net, dataset, rows, out)
 
 
 def run_epochs(args, env, net, dataset, order, step, carry, out):
@@ -467,13 +475,15 @@ def run_epochs(args, env, net, dataset, order, step, carry, out):
             row = {"iteration": len(rows) + 1, "samples": len(order) * (len(rows) + 1)}
             row |= {"seconds": time.perf_counter() - start, "train_error": loss, **metrics}
             rows.append({name: float(f"{value:.6g}") for name, value in row.items()})
-            records.save_rows(out / "metrics.csv", rows)
+            if out:
+                records.save_rows(out / "metrics.csv", rows)
             reporter.show(rows[-1], speed)
             if not np.isfinite(loss):
                 raise records.UserError(f"the error is not finite after epoch {len(rows)}; lower --lr")
             if metrics["error"] < best:
                 best = metrics["error"]
-                records.save(out / "pidm.msgpack", carry[0], checkpoint_meta(args, dataset, net.sizes, rows[-1]))
+                if out:
+                    records.save(out / "pidm.msgpack", carry[0], checkpoint_meta(args, dataset, net.sizes, rows[-1]))
     if reporter.stopped:
         print("interrupted")
     return rows
@@ -495,6 +505,7 @@ def report(args, env, net, dataset, rows, out):
 def main(args):
     """Train a PIDM. UserErrors end in one line and exit code 2."""
     try:
+        devices.join(args.distributed)
         return pretrain(args)
     except records.UserError as error:
         print(f"error: {error}", file=sys.stderr)

@@ -43,6 +43,8 @@ class Physics:
 class Engine:
     """What both engines share: the compiled model, the randomised fields and the sensor layout."""
 
+    many_devices = True  # whether its simulations can be spread over several
+
     def __init__(self, spec, decimation):
         self.model, self.decimation = spec.compile(), decimation
         self.robot_geoms = self.model.geom_contype > 0
@@ -88,6 +90,8 @@ class Engine:
 
 class CEngine(Engine):
     """MuJoCo C on all CPU threads. Results do not depend on the number of threads."""
+
+    many_devices = False  # a callback has the arrays of all simulations
 
     INPUTS = ("qpos", "qvel", "warmstart", "mocap_pos", "mocap_quat", "wrench", "friction", "mass_scale")
     OUTPUTS = ("qpos", "qvel", "warmstart", "qacc", "sensors", "qfrc_actuator")
@@ -160,8 +164,9 @@ class MjxEngine(Engine):
         spec = spec.copy()
         for sensor in [s for s in spec.sensors if s.type == mujoco.mjtSensor.mjSENS_CONTACT]:
             spec.delete(sensor)
-        self.mjx_model = mjx.put_model(spec.compile(), impl="jax")
-        self.mjx_data = mjx.make_data(self.mjx_model, impl="jax")
+        mine = jax.local_devices()[0]  # its default is the first device of all, which may be another host's
+        self.mjx_model = mjx.put_model(spec.compile(), device=mine, impl="jax")
+        self.mjx_data = mjx.make_data(self.mjx_model, device=mine, impl="jax")
 
     def contact_sensors(self):
         """Which geoms each contact sensor covers, (sensors, ngeom) of 0 and 1. They must come last in the MJCF."""

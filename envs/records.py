@@ -59,20 +59,25 @@ def check_positive(args, names):
 
 
 def check_minibatches(args):
-    """UserError unless the minibatches divide a rollout."""
-    size = args.num_envs * args.num_steps
-    if size % args.num_minibatches:
+    """UserError unless the minibatches divide a rollout, and devices and blocks its environments."""
+    size, count = args.num_envs * args.num_steps, jax.device_count()
+    if args.num_envs % args.shuffle_blocks or args.num_envs % count:
+        raise UserError(
+            f"{args.num_envs} environments cannot be split over {count} devices in {args.shuffle_blocks} blocks; "
+            "change --num-envs or --shuffle-blocks"
+        )
+    if size // args.shuffle_blocks % args.num_minibatches:
         raise UserError(
             f"{args.num_minibatches} minibatches do not divide a rollout of {args.num_envs} environments x "
             f"{args.num_steps} steps = {size}; change --num-minibatches or --num-envs"
         )
 
 
-def start_runs(each, config):
-    """Create the folder of each of these arguments and return them. UserError, and nothing touched, if one is taken."""
+def start_runs(each, config, force):
+    """start_run in the run_dir of each of these arguments. UserError, and nothing touched, if one is taken."""
     for args in each:
-        refuse_overwrite(Path(args.run_dir), args.force)
-    return [start_run(args, config) for args in each]
+        refuse_overwrite(Path(args.run_dir), force)
+    return [start_run(args, config, args.run_dir, force) for args in each]
 
 
 def refuse_overwrite(out, force):
@@ -81,13 +86,13 @@ def refuse_overwrite(out, force):
         raise UserError(f"{out} holds a run already; pass --force to overwrite it or --run-dir for another folder")
 
 
-def start_run(args, config):
-    """Create the folder args.run_dir with args.json in it and return it. Refuses to overwrite a run unless args.force.
+def start_run(args, config, folder, force):
+    """Create the run folder with args.json in it and return it. Refuses to overwrite a run unless `force`.
 
     args and config (the task's) are dataclasses; both are recorded, with versions, commit and device.
     """
-    out = Path(args.run_dir)
-    refuse_overwrite(out, args.force)
+    out = Path(folder)
+    refuse_overwrite(out, force)
     record = dataclasses.asdict(args) | {"config": dataclasses.asdict(config), "versions": versions()}
     try:
         out.mkdir(parents=True, exist_ok=True)

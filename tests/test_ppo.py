@@ -12,7 +12,14 @@ import ppo_finetune as script
 from envs.base import State
 
 ARGS = script.Args(
-    num_envs=4, num_steps=3, num_minibatches=2, gamma=0.9, gae_lambda=0.8, entropy_coef=0.01, mirror_coef=0.1
+    shuffle_blocks=1,
+    num_envs=4,
+    num_steps=3,
+    num_minibatches=2,
+    gamma=0.9,
+    gae_lambda=0.8,
+    entropy_coef=0.01,
+    mirror_coef=0.1,
 )
 
 
@@ -232,3 +239,16 @@ def test_update_visits_every_sample_once_an_epoch(monkeypatch):
     zeros = jnp.zeros((3, 4))
     *_, metrics = script.update(args, None, None, opt, state, roll, zeros, zeros, jax.random.key(0))
     np.testing.assert_array_equal(metrics["seen"], 3 * np.ones(12))
+
+
+@pytest.mark.parametrize("blocks", [1, 2])
+def test_minibatches_shuffle_within_blocks_of_environments(blocks):
+    """Every sample once, half of every minibatch from each of two blocks, not in order."""
+    args = dataclasses.replace(ARGS, num_envs=4, num_steps=6, num_minibatches=3, shuffle_blocks=blocks)
+    env = jnp.tile(jnp.arange(4), (6, 1))
+    sample = jnp.arange(24).reshape(6, 4)
+    got, of_env = script.minibatches(args, jax.random.key(0), (sample, env))
+    assert got.shape == (3, 8) and sorted(got.ravel().tolist()) == list(range(24)) != got.ravel().tolist()
+    np.testing.assert_array_equal(got % 4, of_env)
+    if blocks == 2:
+        np.testing.assert_array_equal((of_env < 2).sum(1), 4)

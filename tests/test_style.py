@@ -10,6 +10,8 @@ ROOT = Path(__file__).resolve().parent.parent
 SCRIPTS = [path.name for path in ROOT.glob("*.py")]
 ENVS = [f"envs/{path.name}" for path in (ROOT / "envs").glob("*.py")]
 LAYERS = [
+    "records",
+    "devices",
     "robots",
     "terrain",
     "engine",

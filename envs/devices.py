@@ -1,0 +1,75 @@
+"""Many devices, on one host or several: environments are split over all of them, all else is the same on each.
+
+The scripts read as for one device. The compiler adds the communication where these shardings ask for it: gradients and
+statistics are means over all environments, and minibatches are shuffled within each device's block of them.
+"""
+
+import os
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+
+from envs import records
+
+
+def join(distributed):
+    """With --distributed: one process of many, one a host; all but the first print nothing.
+
+    SLURM and Open MPI tell a process who it is; elsewhere set JAX_COORDINATOR_ADDRESS (host:port of process 0),
+    JAX_NUM_PROCESSES and JAX_PROCESS_ID. UserError if nothing does.
+    """
+    if not distributed:
+        return
+    count, own = (os.environ.get(f"JAX_{name}") for name in ("NUM_PROCESSES", "PROCESS_ID"))
+    try:
+        jax.distributed.initialize(num_processes=count and int(count), process_id=own and int(own))
+    except (ValueError, RuntimeError) as error:
+        raise records.UserError(f"--distributed: {error}; see envs/devices.py for what a process must know") from None
+    if not is_first():
+        sys.stdout = open(os.devnull, "w")  # noqa: SIM115, for the rest of the process
+
+
+def is_first():
+    """Whether this process prints and writes files."""
+    return jax.process_index() == 0
+
+
+def check_engine(engine):
+    """ValueError if there are several devices and this engine cannot use them."""
+    if jax.device_count() > 1 and not engine.many_devices:
+        raise ValueError(f"engine c works on one device, here are {jax.device_count()}; choose --engine mjx")
+
+
+def mesh():
+    """All devices of all hosts in a row."""
+    return Mesh(np.array(jax.devices()), ("devices",))
+
+
+def same():
+    """Sharding of an array that every device has whole."""
+    return NamedSharding(mesh(), PartitionSpec())
+
+
+def split(axis):
+    """Sharding of an array of which every device has a part of this axis."""
+    return NamedSharding(mesh(), PartitionSpec(*[None] * axis, "devices"))
+
+
+def of_state(state, axis):
+    """Shardings of a TrainState: its environments, on this axis of `env`, are split."""
+    return jax.tree.map(lambda _: same(), state).replace(env=jax.tree.map(lambda _: split(axis), state.env))
+
+
+def place(tree, shardings):
+    """Arrays that every process has alike, laid out over the devices by a tree of shardings."""
+
+    def put(x, sharding):
+        if jnp.issubdtype(x.dtype, jax.dtypes.prng_key):
+            return jax.random.wrap_key_data(put(jax.random.key_data(x), sharding))
+        whole = np.asarray(x)
+        return jax.make_array_from_callback(whole.shape, sharding, lambda index: whole[index])
+
+    return jax.tree.map(put, tree, shardings)

@@ -1,0 +1,114 @@
+"""Two devices, and two processes, do what one device does. Engine mjx, tiny sizes, CPU devices."""
+
+import csv
+import dataclasses
+import os
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+import ppo_finetune as script
+from envs import records
+
+ROOT = Path(__file__).resolve().parent.parent
+SMOKE = ("--preset", "smoke", "--engine", "mjx", "--num-envs", "8", "--log-every", "2", "--shuffle-blocks", "2")
+TWO = "--xla_force_host_platform_device_count=2"
+
+
+def start(words, flags="", **variables):
+    """A script in a process of its own."""
+    environ = os.environ | variables | {"JAX_PLATFORMS": "cpu", "XLA_FLAGS": f"{os.environ['XLA_FLAGS']} {flags}"}
+    command = [sys.executable, *map(str, words)]
+    return subprocess.Popen(command, cwd=ROOT, env=environ, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def finish(*processes):
+    """Wait for processes that must succeed. Returns what they printed."""
+    outputs = [process.communicate(timeout=280) for process in processes]
+    for process, (_, err) in zip(processes, outputs, strict=True):
+        assert process.returncode == 0, err
+    return [out for out, _ in outputs]
+
+
+def hosts(words):
+    """Two processes on loopback."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        address = f"127.0.0.1:{probe.getsockname()[1]}"
+    known = {"JAX_COORDINATOR_ADDRESS": address, "JAX_NUM_PROCESSES": "2"}
+    return [start([*words, "--distributed"], **known, JAX_PROCESS_ID=str(i)) for i in range(2)]
+
+
+def weights(path, kind):
+    """All numbers of a checkpoint in one vector."""
+    leaves = []
+
+    def collect(tree):
+        for name in sorted(tree):
+            collect(tree[name]) if isinstance(tree[name], dict) else leaves.append(np.ravel(tree[name]))
+
+    collect(records.load(path, kind)[0])
+    return np.concatenate(leaves)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"num_envs": 5}, ["5 environments cannot be split over 2 devices"]),
+        ({"shuffle_blocks": 3}, ["in 3 blocks"]),
+        ({"engine": "c"}, ["engine c works on one device, here are 2"]),
+    ],
+)
+def test_what_cannot_be_split_is_refused(changes, words, tmp_path, refused, monkeypatch):
+    monkeypatch.setattr(jax, "device_count", lambda: 2)
+    args = script.Args(preset="smoke", engine="mjx", run_dir=str(tmp_path / "run"))
+    refused(script.main, dataclasses.replace(args, **changes), *words)
+    assert not (tmp_path / "run").exists()
+
+
+def test_strangers_are_refused(refused):
+    """--distributed where nothing says who this process is."""
+    refused(script.main, script.Args(distributed=True), "--distributed", "envs/devices.py")
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    """A training on one device, on two devices of a process, and on two processes; what the processes printed."""
+    out = tmp_path_factory.mktemp("devices")
+    train = ["ppo_finetune.py", "--task", "go1_loco", *SMOKE, "--run-dir"]
+    finish(start([*train, out / "one"]), start([*train, out / "two"], TWO))
+    return out, finish(*hosts([*train, out / "hosts"]))
+
+
+@pytest.mark.parametrize("many", ["two", "hosts"])
+def test_training_on_two_is_training_on_one(runs, many):
+    """Sums over environments are made in another order: single precision and Adam's first steps allow 1e-4."""
+    policies = [weights(runs[0] / name / "policy.msgpack", "policy") for name in ("one", many)]
+    np.testing.assert_allclose(*policies, atol=1e-4)
+    rows = [list(csv.DictReader((runs[0] / name / "metrics.csv").open())) for name in ("one", many)]
+    for name in ("reward", "kl", "value_loss", "actor_grad_norm"):
+        np.testing.assert_allclose(*(float(row[-1][name]) for row in rows), rtol=1e-3)
+
+
+def test_only_the_first_host_prints_and_writes(runs):
+    out, printed = runs
+    assert "wrote" in printed[0] and "go1_loco:" not in printed[1] and "wrote" not in printed[1]
+    assert sorted(path.name for path in (out / "hosts").iterdir()) == sorted(p.name for p in (out / "one").iterdir())
+
+
+def test_stages_one_and_two_on_two_devices(tmp_path):
+    """Data of two devices are those of one, and so is the PIDM that comes of them."""
+    collect = ["ppo_explore.py", "--robot", "go1", *SMOKE, "--total-steps", "128", "--run-dir"]
+    finish(start([*collect, tmp_path / "one"]), start([*collect, tmp_path / "two"], TWO))
+    arrays = [np.load(tmp_path / name / "x.npy") for name in ("one", "two")]
+    np.testing.assert_allclose(arrays[0][0], arrays[1][0], atol=1e-3)  # joint velocities are of order 5
+    assert np.abs(arrays[0] - arrays[1]).mean() < 0.01
+    pretrain = ["pretrain_pidm.py", "--data", tmp_path / "one", "--preset", "smoke", "--run-dir"]
+    finish(start([*pretrain, tmp_path / "a"]), start([*pretrain, tmp_path / "b"], TWO))
+    checkpoints = [weights(tmp_path / name / "pidm.msgpack", "PIDM checkpoint") for name in "ab"]
+    np.testing.assert_allclose(*checkpoints, atol=1e-4)
