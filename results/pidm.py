@@ -101,6 +101,29 @@ def walking_error(robot, task, num_envs=256, steps=200):
     return float(error.mean() / size.mean())
 
 
+def feature_size(task, **choice):
+    """Root mean square of the actor's backbone output over the first rollout of a task."""
+    env = ppo_finetune.envs.make(task, "c")
+    args = ppo_finetune.merge(ppo_finetune.Args(task=task, network="pidm", **choice), env.config.ppo)
+    net = ppo_finetune.make_net(args, env)
+    state = ppo_finetune.init_state(args, env, net, ppo_finetune.optax.scale_by_adam())
+
+    @jax.jit
+    def features(state):
+        _, roll, _ = ppo_finetune.rollout(args, env, net, state.params, state.env, state.key)
+        _, seen = net.apply(state.params, roll.inputs, capture_intermediates=True, mutable=["intermediates"])
+        return ppo_finetune.nn.elu(seen["intermediates"]["actor"]["backbone"]["__call__"][0])
+
+    return float(jnp.sqrt((features(state) ** 2).mean()))
+
+
+def feature_sizes(robot, task):
+    """`feature_size` of a fresh, a loaded and a shuffled core."""
+    loaded = {"pretrained": str(ROOT / f"assets/pidm/{robot}.msgpack")}
+    choices = {"fresh": {}, "loaded": loaded, "shuffled": loaded | {"init": "shuffled"}}
+    return {f"backbone features in {task}, {name}": feature_size(task, **one) for name, one in choices.items()}
+
+
 def occupied(env, x, bins=20):
     """Share of a grid over each pair of joints of a limb that x (S, X) visits, mean over pairs."""
     low, high = env.model.jnt_range[1:].T
@@ -178,6 +201,7 @@ def look(args, robot):
     coverage = {f"joint space, {name}": occupied(env, x) for name, x in kinds.items()}
     coverage |= novelty(env, pretrain_pidm.Dataset(ROOT / f"runs/explore/{robot}/seed0"), kept / "novelty.png")
     coverage[f"normalized_error, recorded policy of {task}"] = walking_error(robot, task)
+    coverage |= feature_sizes(robot, task)
     print(robot, records.line(coverage))
     records.replace_text(kept / "coverage.json", json.dumps(coverage, indent=1) + "\n")
     name, points = project([x[::5] for x in kinds.values()])
@@ -200,7 +224,8 @@ Made by `python results/pidm.py`, which runs, for each robot,
 
 Errors are on held-out environments, with the tasks' sensor noise. Joint space is the share of a 20 x 20 grid over each
 pair of neighbouring joints of a limb that 20,000 samples visit. Disagreement is that of an ensemble trained on the
-first tenth of the collection, there and on the last tenth.
+first tenth of the collection, there and on the last tenth. The recorded policy is that of results/tasks, acting with its
+noise: how well the PIDM knows a gait that it never saw. Backbone features are root mean squares over the first rollout.
 
 """
 
