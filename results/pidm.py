@@ -224,8 +224,8 @@ Made by `python results/pidm.py`, which runs, for each robot,
 
 Errors are on held-out environments, with the tasks' sensor noise. Joint space is the share of a 20 x 20 grid over each
 pair of neighbouring joints of a limb that 20,000 samples visit. Disagreement is that of an ensemble trained on the
-first tenth of the collection, there and on the last tenth. The recorded policy is that of results/tasks, with its noise:
-how well the PIDM knows a gait that it never saw. Backbone features are root mean squares over the first rollout.
+first tenth of the collection, there and on the last tenth. The recorded policy is that of results/tasks, with its
+noise: how well the PIDM knows a gait that it never saw. Backbone features are root mean squares over the first rollout.
 
 """
 
