@@ -81,6 +81,16 @@ def test_task_table_is_what_was_recorded(task):
     assert row.endswith(f"| {scale} | {minutes}, {result} |")
 
 
+def test_demo_is_what_was_recorded():
+    run = ROOT / "results/tasks/demo"
+    result = json.loads((run / "eval.json").read_text())["task"]
+    with (run / "metrics.csv").open() as file:
+        minutes = float(list(csv.DictReader(file))[-1]["seconds"]) / 60
+    text = " ".join(README.split())
+    assert f"training took {minutes:.1f} minutes" in text
+    assert f"to {result['lin_vel_error']:.2f} m/s with {100 * result['falls']:.0f}% falls" in text
+
+
 def test_missing_runs_are_called_missing():
     for task in envs.TASKS.keys() - set(RECORDED):
         row = next(line for line in README.splitlines() if line.startswith(f"| `{task}` |"))
