@@ -86,7 +86,7 @@ PRESETS = {
 
 
 COUNTS = ("num_envs", "num_steps", "total_steps", "log_every", "num_epochs", "num_minibatches", "members")
-COUNTS += ("buffer_rollouts", "ensemble_steps", "ensemble_batch")
+COUNTS += ("buffer_rollouts", "ensemble_steps", "ensemble_batch", "shuffle_blocks")
 
 
 def num_held_out(args):
@@ -97,9 +97,9 @@ def num_held_out(args):
 def merge(args, ppo):
     """Fill what is None in args from the preset, then from the robot's own settings `ppo`; check the sizes."""
     values = PRESETS[args.preset] | {"hidden": ppo["hidden"], "init_std": ppo["init_std"]}
+    values |= {"shuffle_blocks": jax.device_count()}
     values |= {"entropy_coef": ppo["entropy"], "run_dir": f"runs/explore/{args.robot}/seed{args.seed}"}
     args = dataclasses.replace(args, **{name: v for name, v in values.items() if getattr(args, name) is None})
-    args = dataclasses.replace(args, shuffle_blocks=args.shuffle_blocks or jax.device_count())
     records.check_positive(args, COUNTS)
     if not 0 < args.validation < 1 or num_held_out(args) == args.num_envs:
         raise records.UserError(

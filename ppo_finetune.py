@@ -85,7 +85,7 @@ PRESETS = {
 
 
 COUNTS = ("num_seeds", "num_envs", "num_steps", "total_steps", "log_every", "num_epochs", "num_minibatches")
-COUNTS += ("eval_envs",)
+COUNTS += ("eval_envs", "shuffle_blocks")
 
 
 def method_name(args):
@@ -107,9 +107,9 @@ def merge(args, ppo):
     values = PRESETS[args.preset] | ppo.get(args.preset, {})
     values |= {"hidden": ppo["hidden"], "init_std": ppo["init_std"], "entropy_coef": ppo["entropy"]}
     folder = f"runs/{args.task}/{method_name(args)}"
+    values |= {"shuffle_blocks": jax.device_count()}
     values |= {"run_dir": folder if args.num_seeds > 1 else f"{folder}/seed{args.seed}"}
     args = dataclasses.replace(args, **{name: v for name, v in values.items() if getattr(args, name) is None})
-    args = dataclasses.replace(args, shuffle_blocks=args.shuffle_blocks or jax.device_count())
     records.check_positive(args, COUNTS)
     records.check_minibatches(args)
     return args

@@ -61,6 +61,8 @@ def weights(path, kind):
     [
         ({"num_envs": 5}, ["5 environments cannot be split over 2 devices"]),
         ({"shuffle_blocks": 3}, ["in 3 blocks"]),
+        ({"shuffle_blocks": 0}, ["--shuffle-blocks must be at least 1, not 0"]),
+        ({"shuffle_blocks": -1}, ["--shuffle-blocks must be at least 1, not -1"]),
         ({"engine": "c"}, ["engine c works on one device, here are 2"]),
     ],
 )
@@ -71,9 +73,11 @@ def test_what_cannot_be_split_is_refused(changes, words, tmp_path, refused, monk
     assert not (tmp_path / "run").exists()
 
 
-def test_strangers_are_refused(refused):
-    """--distributed where nothing says who this process is."""
-    refused(script.main, script.Args(distributed=True), "--distributed", "envs/devices.py")
+def test_strangers_are_refused():
+    """--distributed where nothing says who this process is; in a process of its own, for JAX must not have started."""
+    process = start(["ppo_finetune.py", "--distributed"])
+    _, err = process.communicate(timeout=120)
+    assert process.returncode == 2 and err.startswith("error: --distributed: ") and "envs/devices.py" in err, err
 
 
 @pytest.fixture(scope="module")
