@@ -59,6 +59,7 @@ class Args:
     total_steps: int | None = None  # environment steps of the whole run
     # --- Network (tasks' own tables) ---
     hidden: tuple[int, ...] | None = None  # widths of the MLP's hidden layers
+    intention: tuple[int, ...] | None = None  # of the PIDM's intention encoder but the last; None: as in pretraining
     init_std: float | None = None  # initial action std, in action units
     # --- PPO (rsl_rl) ---
     num_epochs: int = 5  # passes over each rollout
@@ -104,8 +105,8 @@ def merge(args, ppo):
         raise records.UserError("--pretrained loads a PIDM; leave out --network mlp")
     if args.init != "both" and not args.pretrained:
         raise records.UserError(f"--init {args.init} needs --pretrained CHECKPOINT")
-    values = PRESETS[args.preset] | ppo.get(args.preset, {})
-    values |= {"hidden": ppo["hidden"], "init_std": ppo["init_std"], "entropy_coef": ppo["entropy"]}
+    values = {"hidden": ppo["hidden"], "init_std": ppo["init_std"], "entropy_coef": ppo["entropy"]}
+    values |= {"intention": ppo.get("intention")} | PRESETS[args.preset] | ppo.get(args.preset, {})
     folder = f"runs/{args.task}/{method_name(args)}"
     values |= {"shuffle_blocks": jax.device_count()}
     values |= {"run_dir": folder if args.num_seeds > 1 else f"{folder}/seed{args.seed}"}
@@ -267,7 +268,7 @@ def make_net(args, env):
     if args.network == "mlp":
         return ActorCritic(args.hidden, env.action_dim, args.init_std)
     sizes = SIZES[env.robot.name]
-    wide = env.config.ppo.get("intention", sizes.goal[:-1])  # perceptive tasks need more to see with
+    wide = args.intention or sizes.goal[:-1]  # perceptive tasks need more to see with
     sizes = dataclasses.replace(sizes, goal=(*wide, sizes.goal[-1]))
     return PIDMActorCritic(sizes, env.prop_dim, env.action_dim, args.init_std)
 
@@ -649,8 +650,8 @@ def run_eval(args):
             f"{path} is a policy for {meta['task']}, not for {args.task}; pass --task {meta['task']}"
         )
     env, show = make_env(args), make_env(args, **showcase(args))
-    trained = {name: meta["args"][name] for name in ("network", "init_std")}
-    net = make_net(dataclasses.replace(args, **trained, hidden=tuple(meta["args"]["hidden"])), env)
+    trained = {name: meta["args"].get(name) for name in ("network", "init_std", "hidden", "intention")}
+    net = make_net(dataclasses.replace(args, **trained), env)
     like = jax.eval_shape(net.init, jax.random.key(0), zero_inputs(env, net))
     records.check_shapes(path, params, like)
     report = {}

@@ -284,7 +284,13 @@ def parkour(skill, weights=(), **changes):
             "intention": (512, 256),  # of the PIDM's intention encoder, before its last layer
             "entropy": 0.005,
             "init_std": 0.6,
-            "cpu": {"num_envs": 512, "num_steps": 48, "total_steps": 12_000_000},
+            "cpu": {
+                "num_envs": 512,
+                "num_steps": 48,
+                "total_steps": 12_000_000,
+                "hidden": (256, 128, 128),
+                "intention": (256, 128),
+            },
             "gpu": {"num_steps": 48, "total_steps": 393_000_000},
         },
         "episode_seconds": 6.0,
