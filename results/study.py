@@ -12,8 +12,6 @@ import csv
 import itertools
 import json
 import shlex
-import shutil
-import subprocess
 import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -24,6 +22,8 @@ import tyro
 
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
+
+import recording
 
 import envs
 
@@ -52,9 +52,9 @@ class Args:
 
 
 def command(args, task, method, folder, seed):
-    """The training command of one run, as words after `python`."""
+    """The arguments of ppo_finetune.py for one run."""
     robot = envs.TASKS[task][1].robot
-    words = ["ppo_finetune.py", "--task", task, "--preset", args.scale, "--seed", str(seed)]
+    words = ["--task", task, "--preset", args.scale, "--seed", str(seed)]
     words += [word.format(robot=robot) for word in METHODS[method]]
     words += ["--total-steps", str(args.total_steps)] if args.total_steps else []
     return [*words, "--run-dir", f"runs/{folder}", "--force"]
@@ -71,18 +71,13 @@ def finished(folder):
     return float(rows[-1]["env_steps"]) >= wanted
 
 
-def run(args, task, words, folder):
+def run(task, words, folder):
     """Train, evaluate and keep the small files."""
-    log = ROOT / "runs" / folder
-    log.mkdir(parents=True, exist_ok=True)
-    evaluate = ["ppo_finetune.py", "--task", task, "--eval", f"runs/{folder}/policy.msgpack"]
-    with (log / "log.txt").open("w") as file:
-        for step in (words, evaluate):
-            subprocess.run([sys.executable, *step], cwd=ROOT, check=True, stdout=file, stderr=subprocess.STDOUT)
-    kept = ROOT / "results" / folder
-    kept.mkdir(parents=True, exist_ok=True)
-    for name in KEPT:
-        shutil.copy(log / name, kept / name)
+    log = ROOT / "runs" / folder / "log.txt"
+    log.parent.mkdir(parents=True, exist_ok=True)
+    with log.open("w") as file:
+        recording.finetune(words, file)
+        recording.evaluate(task, folder, ROOT / "results" / folder, KEPT, file)
 
 
 def main(args):
@@ -96,13 +91,13 @@ def main(args):
         folder = f"study/{args.scale}/{task}/{method}/seed{seed}"
         words = command(args, task, method, folder, seed)
         if args.list:
-            print(shlex.join(["python", *words]))
+            print(shlex.join(["python", "ppo_finetune.py", *words]))
         elif finished(folder):
             print(f"done     {folder}", flush=True)
         elif time.perf_counter() - start > 60 * args.budget_minutes:
             print(f"no time  {folder}", flush=True)
         else:
-            run(args, task, words, folder)
+            run(task, words, folder)
             print(f"ran      {folder}  {(time.perf_counter() - start) / 60:.1f} min", flush=True)
 
     with ThreadPoolExecutor(args.jobs) as pool:

@@ -9,8 +9,6 @@ trained policy's mean action succeeds there.
 
 import csv
 import json
-import shutil
-import subprocess
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +19,8 @@ import tyro
 
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
+
+import recording
 
 import envs
 from envs import records
@@ -59,16 +59,11 @@ def main(args):
         print(f"error: unknown task {name!r}; known: {', '.join(envs.TASKS)}", file=sys.stderr)
         sys.exit(2)
     for task in args.tasks:
-        out, kept = ROOT / "runs/tasks" / task, ROOT / "results/tasks" / task
-        words = [sys.executable, "ppo_finetune.py", "--task", task]
+        run, kept = f"tasks/{task}", ROOT / "results/tasks" / task
         if "train" in args.stages:
-            train = ["--preset", args.preset, "--run-dir", f"runs/tasks/{task}", "--force"]
-            subprocess.run([*words, *train], cwd=ROOT, check=True)
+            recording.finetune(["--task", task, "--preset", args.preset, "--run-dir", f"runs/{run}", "--force"])
         if "look" in args.stages:
-            subprocess.run([*words, "--eval", f"runs/tasks/{task}/policy.msgpack"], cwd=ROOT, check=True)
-            kept.mkdir(parents=True, exist_ok=True)
-            for name in KEPT:
-                shutil.copy(out / name, kept / name)
+            recording.evaluate(task, run, kept, KEPT)
             if "level 0" in json.loads((kept / "eval.json").read_text()):
                 draw_levels(kept)
                 print(f"wrote {kept / 'levels.png'}")
