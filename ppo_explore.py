@@ -13,7 +13,6 @@ K history, M ensemble members, R transitions in the ring buffer.
 import dataclasses
 import json
 import os
-import sys
 import time
 from dataclasses import dataclass
 from functools import partial
@@ -703,15 +702,10 @@ def plot(rows, path):
 
 
 def main(args):
-    """Collect data. UserErrors end in one line and exit code 2."""
-    try:
+    """Collect data. What a user can mend ends in one line and exit code 2."""
+    with records.one_line_errors():
         devices.join(args.distributed)
         return explore(args)
-    except records.UserError as error:
-        print(f"error: {error}", file=sys.stderr)
-        sys.exit(2)
-    except KeyboardInterrupt:  # before the first row
-        sys.exit("interrupted")
 
 
 if __name__ == "__main__":

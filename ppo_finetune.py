@@ -12,7 +12,6 @@ K history.
 
 import dataclasses
 import json
-import sys
 import time
 from dataclasses import dataclass
 from functools import partial
@@ -763,15 +762,10 @@ def keep(seeds, outs, states, metrics, rows, seconds):
 
 
 def main(args):
-    """Train, or evaluate with --eval. UserErrors end in one line and exit code 2."""
-    try:
+    """Train, or evaluate with --eval. What a user can mend ends in one line and exit code 2."""
+    with records.one_line_errors():
         devices.join(args.distributed)
         return run_eval(args) if args.eval else train(args)
-    except records.UserError as error:
-        print(f"error: {error}", file=sys.stderr)
-        sys.exit(2)
-    except KeyboardInterrupt:  # before the first row: nothing to save yet
-        sys.exit("interrupted")
 
 
 if __name__ == "__main__":

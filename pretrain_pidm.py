@@ -9,7 +9,6 @@ Shapes in comments: B batch, X proprioception x_t, A action, K history.
 
 import dataclasses
 import json
-import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -503,15 +502,10 @@ def report(args, env, net, dataset, rows, out):
 
 
 def main(args):
-    """Train a PIDM. UserErrors end in one line and exit code 2."""
-    try:
+    """Train a PIDM. What a user can mend ends in one line and exit code 2."""
+    with records.one_line_errors():
         devices.join(args.distributed)
         return pretrain(args)
-    except records.UserError as error:
-        print(f"error: {error}", file=sys.stderr)
-        sys.exit(2)
-    except KeyboardInterrupt:  # before the first row
-        sys.exit("interrupted")
 
 
 if __name__ == "__main__":

@@ -299,7 +299,7 @@ class Env:
             episode_return=zero,
             key=key,
             task=task,
-            metrics=self.metrics(no, {name: zero for name in self.config.weights}, task, motion, no),
+            metrics=self.metrics(physics, ~no, {name: zero for name in self.config.weights}, task, motion, no),
         )
 
     def step(self, state, action):
@@ -322,7 +322,7 @@ class Env:
         reward += self.config.termination_reward * terminated
         clock = state.clock + 1
         truncated = (clock >= self.episode_steps) & ~terminated
-        metrics = self.metrics(~healthy, terms, task, motion, truncated)
+        metrics = self.metrics(physics, healthy, terms, task, motion, truncated)
         fresh = self.reset(k_reset, curriculum=self.graduate(k_grade, task, motion, terminated, truncated))
 
         # what the robot sees next
@@ -354,13 +354,14 @@ class Env:
             | {"episode_return": stepped.episode_return, "episode_seconds": clock.astype(jnp.float32) * self.dt},
         )
 
-    def metrics(self, diverged, terms, task, motion, truncated):
-        """What one step reports: weighted reward terms, the task's metrics, divergence, the finished episode.
+    def metrics(self, physics, healthy, terms, task, motion, truncated):
+        """What one step reports: weighted reward terms, the task's metrics, faults of the engine, the finished episode.
 
         Names that start with `episode_` count where an episode ends, all others in every step.
         """
         report = {f"reward/{name}": value for name, value in terms.items()} | self.task_metrics(task, motion, truncated)
-        return report | {"diverged": diverged, "episode_return": jnp.zeros(()), "episode_seconds": jnp.zeros(())}
+        faults = {"diverged": ~healthy} | ({"overflow": physics.overflow} if self.engine.bounded else {})
+        return report | faults | {"episode_return": jnp.zeros(()), "episode_seconds": jnp.zeros(())}
 
     def spawn(self, key, course):
         """Physics at the start of an episode: default pose, random place and heading, feet on the ground."""

@@ -38,9 +38,12 @@ def is_first():
 
 
 def check_engine(engine):
-    """ValueError if there are several devices and this engine cannot use them."""
+    """ValueError if this engine cannot use the devices that are here."""
+    name = type(engine).__name__.removesuffix("Engine").lower()
     if jax.device_count() > 1 and not engine.many_devices:
-        raise ValueError(f"engine c works on one device, here are {jax.device_count()}; choose --engine mjx")
+        raise ValueError(f"engine {name} works on one device, here are {jax.device_count()}; choose --engine mjx")
+    if name == "warp" and jax.default_backend() != "gpu":
+        raise ValueError("engine warp needs an NVIDIA GPU, here is none that JAX sees; choose --engine c")
 
 
 def mesh():

@@ -2,11 +2,17 @@
 
     c     MuJoCo's own C code on a thread pool (mujoco.batch), called from inside jit; for CPUs
     mjx   MuJoCo rewritten in JAX; for GPUs and TPUs
+    warp  MuJoCo rewritten in NVIDIA Warp, called through MJX; for NVIDIA GPUs (on a CPU it runs, for tests)
 
-Both are pure functions of a `Physics` and may be vmapped, to any depth.
+All are pure functions of a `Physics` and may be vmapped, to any depth. The contact solver starts each control step from
+nothing: joint targets have just jumped, and its last solution would be no better a first guess.
 """
 
+import copy
+import importlib.util
+import math
 import threading
+from functools import partial
 
 import flax
 import jax
@@ -27,7 +33,6 @@ class Physics:
     # state
     qpos: jax.Array  # (nq,) base position (world), base quaternion wxyz, joint angles
     qvel: jax.Array  # (nv,) base velocity (world), base angular velocity (base frame), joint velocities
-    warmstart: jax.Array  # (nv,) the solver's first guess
     # what tasks and randomisation set
     mocap_pos: jax.Array  # (M, 3) [m]
     mocap_quat: jax.Array  # (M, 4)
@@ -38,12 +43,14 @@ class Physics:
     qacc: jax.Array  # (nv,) in the last physics step
     torque: jax.Array  # (nu,) [N m] kp part of the last physics step, kd part of now
     sensors: jax.Array  # (S,) site poses and velocities now, contact forces of the last physics step
+    overflow: jax.Array  # () bool: a bounded engine dropped contacts or constraints in the last control step
 
 
 class Engine:
-    """What both engines share: the compiled model, the randomised fields and the sensor layout."""
+    """What all engines share: the compiled model, the randomised fields and the sensor layout."""
 
     many_devices = True  # whether its simulations can be spread over several
+    bounded = False  # whether it has room for so many contacts only and drops others
 
     def __init__(self, spec, decimation):
         self.model, self.decimation = spec.compile(), decimation
@@ -55,7 +62,6 @@ class Engine:
         return Physics(
             qpos=qpos,
             qvel=qvel,
-            warmstart=jnp.zeros(m.nv),
             mocap_pos=jnp.zeros((m.nmocap, 3)),
             mocap_quat=jnp.tile(jnp.array([1.0, 0, 0, 0]), (m.nmocap, 1)),
             wrench=jnp.zeros((m.nbody, 6)),
@@ -64,6 +70,7 @@ class Engine:
             qacc=jnp.zeros(m.nv),
             torque=jnp.zeros(m.nu),
             sensors=jnp.zeros(m.nsensordata),
+            overflow=jnp.zeros((), bool),
         )
 
     def sensor(self, *names):
@@ -93,10 +100,10 @@ class CEngine(Engine):
 
     many_devices = False  # a callback has the arrays of all simulations
 
-    INPUTS = ("qpos", "qvel", "warmstart", "mocap_pos", "mocap_quat", "wrench", "friction", "mass_scale")
-    OUTPUTS = ("qpos", "qvel", "warmstart", "qacc", "sensors", "qfrc_actuator")
+    INPUTS = ("qpos", "qvel", "mocap_pos", "mocap_quat", "wrench", "friction", "mass_scale")
+    OUTPUTS = ("qpos", "qvel", "qacc", "sensors", "qfrc_actuator")
     # our field -> MjData's, where they differ
-    MUJOCO = {"warmstart": "qacc_warmstart", "wrench": "xfrc_applied", "sensors": "sensordata"}
+    MUJOCO = {"wrench": "xfrc_applied", "sensors": "sensordata"}
 
     def __init__(self, spec, decimation):
         super().__init__(spec, decimation)
@@ -133,6 +140,7 @@ class CEngine(Engine):
             for name, value in (inputs | {"ctrl": ctrl}).items():
                 row = batch.bind(self.MUJOCO.get(name, name))
                 row[:] = value.reshape(row.shape)
+            batch.bind("qacc_warmstart")[:] = 0.0
             batch.step(nstep=self.decimation, stage=mujoco.mjtStage.mjSTAGE_VEL)
             return {
                 name: batch.bind(self.MUJOCO.get(name, name)).astype(np.float32).reshape(*lead, -1)
@@ -181,26 +189,34 @@ class MjxEngine(Engine):
 
     def step(self, physics, ctrl):
         """Advance by `decimation` physics steps with joint targets ctrl (nu,) [rad]."""
-        mjx = self.mjx
+        model, data = self.load(self.mjx_model, self.mjx_data, physics, ctrl)
+        data = self.advance(model, data)
+        return self.measure(physics, model, data, self.net_forces(model, data))
+
+    def load(self, model, data, physics, ctrl):
+        """The model with this simulation's randomised fields, the data at its state."""
         fields = self.randomised(jnp, physics.friction, physics.mass_scale)
-        model = self.mjx_model.tree_replace(fields)
-        data = self.mjx_data.replace(
+        return model.tree_replace(fields), data.replace(
             qpos=physics.qpos,
             qvel=physics.qvel,
-            qacc_warmstart=physics.warmstart,
             mocap_pos=physics.mocap_pos,
             mocap_quat=physics.mocap_quat,
             xfrc_applied=physics.wrench,
             ctrl=ctrl,
         )
-        data, _ = jax.lax.scan(lambda d, _: (mjx.step(model, d), None), data, None, self.decimation)
-        forces = self.net_forces(model, data)
+
+    def advance(self, model, data):
+        """`decimation` physics steps."""
+        return jax.lax.scan(lambda d, _: (self.mjx.step(model, d), None), data, None, self.decimation)[0]
+
+    def measure(self, physics, model, data, forces):
+        """Physics after a step: sites where they are now (model and data of implementation jax), forces as given."""
+        mjx = self.mjx
         now = mjx.com_vel(model, mjx.com_pos(model, mjx.kinematics(model, data)))
         sites = mjx.sensor_vel(model, mjx.sensor_pos(model, now)).sensordata
         return physics.replace(
             qpos=data.qpos,
             qvel=data.qvel,
-            warmstart=data.qacc_warmstart,
             qacc=data.qacc,
             torque=self.joint_torque(data.qfrc_actuator, data.qvel),
             sensors=jnp.concatenate([sites, forces.ravel()]),
@@ -216,13 +232,92 @@ class MjxEngine(Engine):
         return (touching[:, two] - touching[:, one]) @ world
 
 
-ENGINES = {"c": CEngine, "mjx": MjxEngine}
+class WarpEngine(MjxEngine):
+    """MuJoCo Warp through MJX. Its memory is fixed: `contacts` for each simulation on average, `rows` of constraints.
+
+    The feet are measured as in MJX, since a second forward pass would solve the contacts again.
+    """
+
+    many_devices = False  # its kernels take all simulations at once, on one device
+    bounded = True
+
+    def __init__(self, spec, decimation):
+        super().__init__(spec, decimation)
+        if importlib.util.find_spec("warp") is None:
+            raise ImportError("engine warp needs the package warp-lang: pip install -r requirements-gpu.txt")
+        geoms = np.sum((self.model.geom_contype > 0) & (self.model.geom_bodyid > 0))
+        self.contacts = 2 * int(geoms)  # a capsule that lies down touches at both ends; few lie at once
+        self.rows = 4 * self.contacts + self.model.nu  # four sides of a friction pyramid, and joint limits
+        self.plain_model = copy.copy(self.model)
+        # it never resets by itself, and refuses the bit that says so
+        self.plain_model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
+        model = self.mjx.put_model(self.plain_model, device=jax.local_devices()[0], impl="warp")
+        self.warp_model = model.tree_replace({"opt._impl.warn_overflow": 0})  # `Physics.overflow` says it
+        self.step = over_all(self.step_all)
+
+    def step_all(self, physics, ctrl):
+        """`step` of N simulations, for whose contacts there must be room: leading axis N on all arrays."""
+        data = self.empty_data(len(ctrl))
+        return jax.vmap(partial(self.step_one, data))(physics, ctrl)
+
+    def step_one(self, data, physics, ctrl):
+        """`step` of one simulation of many, which share the `data` that holds all contacts."""
+        model, data = self.load(self.warp_model, data, physics, ctrl)
+        data = self.advance(model, data)
+        model, seen = self.load(self.mjx_model, self.mjx_data, physics, ctrl)
+        seen = seen.replace(**{name: getattr(data, name) for name in self.SHARED})
+        forces = data.sensordata[-3 * len(self.touching) :]
+        physics = self.measure(physics, model, seen, forces)
+        return physics.replace(overflow=jnp.any(data._impl.overflow & self.NO_ROOM != 0))
+
+    NO_ROOM = 0xFF  # bits of mujoco_warp's OverflowType that are about memory, not about solver iterations
+    SHARED = ("qpos", "qvel", "qacc", "qfrc_actuator")
+
+    def empty_data(self, count):
+        """MJX data with room for the contacts of `count` simulations."""
+        room = {"naconmax": count * self.contacts, "njmax": self.rows}
+        with jax.ensure_compile_time_eval():
+            data = self.mjx.make_data(self.plain_model, device=jax.local_devices()[0], impl="warp", **room)
+            empty = jax.tree.map(lambda x: not np.asarray(x).any(), data)
+        # most is zeros: said so, they need not be stored in the compiled program
+        return jax.tree.map(lambda x, e: jnp.zeros(x.shape, x.dtype) if e else x, data, empty)
+
+
+def over_all(step_all):
+    """A step of one simulation that calls `step_all` with all that it is vmapped over, to any depth, as one batch."""
+
+    @jax.custom_batching.custom_vmap
+    def step(physics, ctrl):
+        lead = ctrl.shape[:-1]
+        count = math.prod(lead)
+        flat = jax.tree.map(lambda x: x.reshape(count, *x.shape[len(lead) :]), (physics, ctrl))
+        return jax.tree.map(lambda x: x.reshape(*lead, *x.shape[1:]), step_all(*flat))
+
+    @step.def_vmap
+    def many(axis_size, batched, physics, ctrl):
+        inputs = jax.tree.map(
+            lambda x, has: x if has else jnp.broadcast_to(x, (axis_size, *x.shape)), (physics, ctrl), tuple(batched)
+        )
+        out = step(*inputs)
+        return out, jax.tree.map(lambda _: True, out)
+
+    return step
+
+
+ENGINES = {"c": CEngine, "mjx": MjxEngine, "warp": WarpEngine}
+
+
+def best_engine():
+    """c on a CPU; on one GPU warp where it is installed; else mjx."""
+    if jax.default_backend() == "cpu":
+        return "c"
+    one_gpu = jax.default_backend() == "gpu" and jax.device_count() == 1
+    return "warp" if one_gpu and importlib.util.find_spec("warp") else "mjx"
 
 
 def make_engine(name, spec, decimation):
-    """Build an engine; "auto" takes c on a CPU and mjx elsewhere. ValueError for a name that does not exist."""
-    if name == "auto":
-        name = "c" if jax.default_backend() == "cpu" else "mjx"
+    """Build an engine; "auto" is `best_engine`. ValueError for a name that does not exist."""
+    name = best_engine() if name == "auto" else name
     if name not in ENGINES:
         raise ValueError(f"unknown engine {name!r}; choose one of auto, {', '.join(ENGINES)}")
     return ENGINES[name](spec, decimation)

@@ -3,6 +3,7 @@
 Every file is replaced in one step, so that a stopped run leaves none half-written.
 """
 
+import contextlib
 import csv
 import dataclasses
 import functools
@@ -23,6 +24,24 @@ import mujoco
 
 class UserError(Exception):
     """Bad input: printed as one line, exit code 2."""
+
+
+@contextlib.contextmanager
+def one_line_errors():
+    """What a user can mend ends the program with one line and exit code 2, Ctrl-C before the first row with 1."""
+    try:
+        yield
+    except UserError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)
+    except jax.errors.JaxRuntimeError as error:
+        if "RESOURCE_EXHAUSTED" not in str(error):
+            raise
+        what = str(error).splitlines()[0][:120]
+        print(f"error: out of memory; lower --num-envs or --num-seeds, in stage 2 --batch ({what})", file=sys.stderr)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        sys.exit("interrupted")
 
 
 @functools.cache
@@ -207,6 +226,7 @@ class Reporter:
     def __init__(self, total, names, over="env_steps"):
         """total: iterations of the run; names: the columns to show; over: the column that counts the work done."""
         self.total, self.names, self.over, self.bar, self.stopped = total, names, over, None, False
+        self.warned = False
 
     def stop(self, *_):
         self.stopped = True  # an exception could strike inside the physics callback
@@ -228,6 +248,9 @@ class Reporter:
             self.bar.stop()
 
     def show(self, row, speed):
+        if row.get("overflow") and not self.warned:
+            self.warned = True
+            print("warning: the engine had no room for some contacts; raise `contacts` of WarpEngine in envs/engine.py")
         shown = {name: row[name] for name in self.names if name in row}
         text = f"{row[self.over] / 1e6:.2f}M {self.over.removeprefix('env_')}  {speed:,.0f}/s  {line(shown)}"
         if self.bar:

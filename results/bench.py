@@ -1,30 +1,53 @@
-"""Measure speed on this machine and write results/bench/<name>.json and README.md with the table.
+"""Measure speed and memory on this machine: results/bench/<machine>.json, and README.md with the tables.
 
     python results/bench.py
+    python results/bench.py --parts engines --tasks go1_loco --engines mjx warp --counts 1024 4096 --machine h200
+    python results/bench.py --parts peers --peers .peers/bin/python
 
-bare      the physics engine alone, moved by random joint targets as at the start of a training
-env       the whole environment step under jit: engine, rewards, observations, resets; the same actions
-training  ppo_finetune.py, learning included, after its compilation
+engines   steps per second of the physics alone ("bare": random joint targets, as at the start of a training) and of the
+          whole environment step ("env": engine, rewards, observations, resets), compile time and memory
+training  ppo_finetune.py with a task's preset, learning included, after compilation
+seeds     five seeds in one program against one seed
+peers     PPO of rsl_rl and Brax; see peers.py
+
+A part that is measured again replaces what stood there. Every figure comes from a process of its own.
 """
 
-import argparse
 import csv
+import itertools
 import json
 import os
 import platform
+import resource
 import subprocess
 import sys
 import tempfile
 import time
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 
 import jax
 import mujoco
+import tyro
 
 import envs
+
+
+@dataclass(frozen=True)
+class Args:
+    tasks: tuple[str, ...] = tuple(envs.TASKS)
+    parts: tuple[Literal["engines", "training", "seeds", "peers"], ...] = ("engines", "training", "seeds")
+    engines: tuple[Literal["c", "mjx", "warp"], ...] = ("c", "mjx")
+    counts: tuple[int, ...] = (256, 1024, 4096)  # environments; mjx and warp on a CPU: 64
+    hidden: tuple[int, ...] | None = None  # widths of the trained MLP; None: the task's
+    peers: str | None = None  # Python that has the peers' packages
+    machine: str = "cpu"  # name of the results
+    limit_s: float = 400.0  # for one figure
+    cell: str | None = None  # internal: measure one figure and print it
 
 
 def rate(function, carry, steps, repeats=3):
@@ -40,135 +63,177 @@ def rate(function, carry, steps, repeats=3):
     return steps / min(times), first - min(times)
 
 
-def stepping(task, engine, num_envs, length, whole):
-    """Control steps per second of the engine alone, or of the whole environment. Returns (steps/s, compile s)."""
+def stepping(task, engine, num_envs, whole):
+    """Speed of the engine alone, or of the whole environment step; with compile time and peak memory."""
     env = envs.make(task, engine)
-    state = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), num_envs))
+    length = 50 if engine == "c" or jax.default_backend() != "cpu" else 10
+    state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), num_envs))
     actions = jax.random.normal(jax.random.key(1), (length, num_envs, env.action_dim))
     step, carry, inputs = jax.vmap(env.step), state, actions
     if not whole:
         targets = env.default_pose + env.robot.action_scale * actions
         step, carry, inputs = jax.vmap(env.engine.step), state.physics, targets
-    many = jax.jit(lambda c: jax.lax.scan(lambda s, a: (step(s, a), None), c, inputs)[0])
-    return rate(many, carry, num_envs * length)
+    many = jax.jit(lambda c, inputs: jax.lax.scan(lambda s, a: (step(s, a), None), c, inputs)[0])
+    speed, compile_s = rate(lambda c: many(c, inputs), carry, num_envs * length)
+    return {"steps/s": speed, "compile s": compile_s, "MiB": memory()}
 
 
-def stepping_mjx(task, num_envs, limit_s=300):
-    """`stepping` of engine mjx in a process of its own; (None, None) if it does not end.
-
-    jaxlib 0.10.2 can lock up on a CPU of two cores where two batched Cholesky factorisations meet (seen with G1).
-    """
-    code = f"import json, bench; print(json.dumps(bench.stepping({task!r}, 'mjx', {num_envs}, 10, False)))"
-    try:
-        run = subprocess.run(
-            [sys.executable, "-c", code],
-            cwd=ROOT / "results",
-            capture_output=True,
-            text=True,
-            timeout=limit_s,
-            check=True,
-        )
-    except subprocess.TimeoutExpired:
-        return None, None
-    return json.loads(run.stdout.splitlines()[-1])
+def memory():
+    """Peak memory [MiB]: of the device where JAX knows it, else of this process."""
+    stats = jax.devices()[0].memory_stats() or {}
+    kib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1024 if sys.platform == "darwin" else 1)
+    return stats["peak_bytes_in_use"] / 2**20 if "peak_bytes_in_use" in stats else kib / 1024
 
 
-def training(task, num_envs):
-    """Steps per second of ppo_finetune.py after its first row, its compile time and the time to that row."""
+def training(task, num_envs=None, hidden=None, num_seeds=1, iterations=40):
+    """Steps per second of ppo_finetune.py after its first row, compile time, and time from start to that row."""
+    ppo = envs.TASKS[task][1].ppo["cpu"]
+    num_envs = num_envs or 512
+    steps = num_envs * ppo.get("num_steps", 24)
     with tempfile.TemporaryDirectory() as folder:
-        command = [sys.executable, "ppo_finetune.py", "--task", task, "--num-envs", str(num_envs), "--run-dir", folder]
-        command += ["--total-steps", str(num_envs * 24 * 40)]
+        words = ["--task", task, "--num-envs", num_envs, "--run-dir", folder, "--force", "--num-seeds", num_seeds]
+        words += ["--total-steps", steps * iterations, *(["--hidden", *hidden] if hidden else [])]
         start, to_first, compile_s = time.perf_counter(), None, None
+        command = [sys.executable, "ppo_finetune.py", *map(str, words)]
         with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
             for text in process.stdout:
                 if text.startswith("compiled in"):
                     compile_s = float(text.split()[2])
                 if " steps " in text and to_first is None:
                     to_first = time.perf_counter() - start
-        with Path(folder, "metrics.csv").open() as file:
+        path = Path(folder, "metrics.csv") if num_seeds == 1 else Path(folder, "seed0/metrics.csv")
+        with path.open() as file:
             rows = list(csv.DictReader(file))
-        steps, seconds = ([float(row[name]) for row in rows] for name in ("env_steps", "seconds"))
-        return (steps[-1] - steps[0]) / (seconds[-1] - seconds[0]), compile_s, to_first
+        count, seconds = ([float(row[name]) for row in rows] for name in ("env_steps", "seconds"))
+        speed = num_seeds * (count[-1] - count[0]) / (seconds[-1] - seconds[0])
+        return {"envs": num_envs, "steps/s": speed, "compile s": compile_s, "start to first row s": to_first}
 
 
-def help_seconds():
-    """Wall time of `ppo_finetune.py --help`, the better of two."""
-    times = []
-    for _ in range(2):
-        start = time.perf_counter()
-        subprocess.run([sys.executable, "ppo_finetune.py", "--help"], cwd=ROOT, capture_output=True, check=True)
-        times.append(time.perf_counter() - start)
-    return min(times)
+def in_process(limit_s, what, *inputs):
+    """One of the functions above in a process of its own, or a row that says why there is no figure.
+
+    jaxlib 0.10.2 can lock up on a CPU of two cores where two batched Cholesky factorisations meet (seen with G1, mjx).
+    """
+    command = [sys.executable, __file__, "--cell", json.dumps([what, *inputs])]
+    try:
+        run = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=limit_s, check=False)
+    except subprocess.TimeoutExpired:
+        return {"failed": f"did not end in {limit_s:.0f} s"}
+    if run.returncode:
+        return {"failed": run.stderr.strip().splitlines()[-1][:120]}
+    return json.loads(run.stdout.splitlines()[-1])
+
+
+def engine_rows(args):
+    """Each task on each engine with each number of environments, bare and whole."""
+    for task, engine in itertools.product(args.tasks, args.engines):
+        slow = engine != "c" and jax.default_backend() == "cpu"
+        for count, what in itertools.product((64,) if slow else args.counts, ("bare", "env")):
+            row = in_process(args.limit_s, "stepping", task, engine, count, what == "env")
+            yield {"task": task, "engine": engine, "what": what, "envs": count} | row
+
+
+def training_rows(args):
+    for task in args.tasks:
+        yield {"task": task} | in_process(args.limit_s, "training", task, 512, args.hidden)
+
+
+def seed_rows(args):
+    for count in (1, 5):
+        row = in_process(5 * args.limit_s, "training", "go1_loco", 256, None, count)
+        yield {"task": "go1_loco", "seeds": count} | row
+
+
+def peer_rows(args):
+    """Ours beside rsl_rl on the same physics and networks, and beside Playground with Brax; 512 environments."""
+    for hidden in ((128, 128, 128), (512, 256, 128)):
+        yield {"what": "ours", "hidden": hidden} | in_process(args.limit_s, "training", "go1_loco", 512, hidden)
+        words = ["rsl_rl", "--hidden", *map(str, hidden)]
+        yield {"what": "rsl_rl", "hidden": hidden} | run_peer(args, words)
+    yield {"what": "playground", "hidden": (512, 256, 128)} | run_peer(args, ["playground"])
+
+
+def run_peer(args, words):
+    command = [args.peers, "results/peers.py", *words]
+    run = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False, env=os.environ)
+    if run.returncode:
+        return {"failed": run.stderr.strip().splitlines()[-1][:120]}
+    return {"envs": 512} | json.loads(run.stdout.splitlines()[-1])
+
+
+ROWS = {"engines": engine_rows, "training": training_rows, "seeds": seed_rows, "peers": peer_rows}
 
 
 def cpu_name():
     """The processor's name, where the system tells it."""
     info = Path("/proc/cpuinfo")
-    names = (
-        [line.split(":")[1].strip() for line in info.read_text().splitlines() if "model name" in line]
-        if info.exists()
-        else []
-    )
+    names = [line.split(":")[1].strip() for line in info.read_text().splitlines() if "model name" in line]
     return names[0] if names else platform.processor() or platform.machine()
 
 
-def measure(tasks, num_envs):
-    """All figures as rows of (what, task, environments, figure, unit)."""
-    rows = []
-    for task in tasks:
-        for what, whole in (("bare", False), ("env", True)):
-            speed, _ = stepping(task, "c", num_envs, 50, whole)
-            rows.append((f"{what}, engine c", task, num_envs, speed, "steps/s"))
-        speed, compile_s, to_first = training(task, num_envs)
-        rows.append(("training, engine c", task, num_envs, speed, "steps/s"))
-        rows.append(("training over bare", task, num_envs, speed / rows[-3][3], "x"))
-        rows.append(("compile", task, num_envs, compile_s, "s"))
-        rows.append(("start to first row", task, num_envs, to_first, "s"))
-        bare = rows[-6][3]
-        speed, compile_s = stepping_mjx(task, 64)
-        rows.append(("bare, engine mjx", task, 64, speed, "steps/s"))
-        rows.append(("compile, engine mjx", task, 64, compile_s, "s"))
-        rows.append(("engine c over mjx", task, "", bare / speed if speed else None, "x"))
-        print("\n".join(as_text(row) for row in rows[-9:]), flush=True)
-    rows.append(("--help", "", "", help_seconds(), "s"))
-    print(as_text(rows[-1]))
-    return rows
-
-
-def as_text(row):
-    what, task, num_envs, figure, unit = row
-    if figure is None:
-        return f"| {what} | {task} | {num_envs} | did not end |"
-    return f"| {what} | {task} | {num_envs} | {figure:,.{0 if figure >= 100 else 2}f} {unit} |"
-
-
-def main():
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--tasks", nargs="+", choices=list(envs.TASKS), default=list(envs.TASKS))
-    parser.add_argument("--num-envs", type=int, default=512)
-    parser.add_argument("--out", default=str(ROOT / "results/bench"))
-    args = parser.parse_args()
+def machine():
+    """What the figures were measured on."""
     git = subprocess.run(["git", "describe", "--always", "--dirty"], cwd=ROOT, capture_output=True, text=True)
-    machine = {
+    return {
         "cpu": cpu_name(),
         "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
-        "device": str(jax.devices()[0]),
+        "device": jax.devices()[0].device_kind,
         "python": platform.python_version(),
         "jax": jax.__version__,
         "mujoco": mujoco.__version__,
         "commit": git.stdout.strip(),
     }
-    print(machine)
-    rows = measure(args.tasks, args.num_envs)
-    out = Path(args.out)
-    out.mkdir(parents=True, exist_ok=True)
-    (out / "cpu.json").write_text(json.dumps({"machine": machine, "rows": rows}, indent=1) + "\n")
-    table = "\n".join(as_text(row) for row in rows)
-    facts = ", ".join(f"{name} {value}" for name, value in machine.items())
-    head = f"# Speed\n\nMade by `python results/bench.py --tasks {' '.join(args.tasks)}` on: {facts}.\n\n"
-    head += "| what | task | environments | figure |\n|---|---|---|---|\n"
-    (out / "README.md").write_text(head + table + "\n")
+
+
+def as_text(value):
+    if isinstance(value, float):
+        return f"{value:,.{0 if abs(value) >= 100 else 2}f}"
+    return "-".join(map(str, value)) if isinstance(value, (list, tuple)) else str(value)
+
+
+def table(rows):
+    """Rows as a Markdown table whose columns are all keys, in order."""
+    columns = list(dict.fromkeys(name for row in rows for name in row))
+    lines = [f"| {' | '.join(columns)} |", "|" + "---|" * len(columns)]
+    lines += [f"| {' | '.join(as_text(row.get(name, '')) for name in columns)} |" for row in rows]
+    return "\n".join(lines)
+
+
+def main(args):
+    if args.cell:
+        what, *inputs = json.loads(args.cell)
+        print(json.dumps({"stepping": stepping, "training": training}[what](*inputs)))
+        return
+    for name in {*args.tasks} - envs.TASKS.keys():
+        print(f"error: unknown task {name!r}; known: {', '.join(envs.TASKS)}", file=sys.stderr)
+        sys.exit(2)
+    if "peers" in args.parts and not (args.peers and Path(args.peers).exists()):
+        print("error: part peers needs --peers PYTHON, of an environment as results/peers.py says", file=sys.stderr)
+        sys.exit(2)
+    out = ROOT / "results/bench"
+    path = out / f"{args.machine}.json"
+    known = json.loads(path.read_text()) if path.exists() else {}
+    for part in args.parts:
+        here, rows = machine(), []
+        print(part, here)
+        for row in ROWS[part](args):
+            rows.append(row)
+            print("  ".join(f"{name} {as_text(value)}" for name, value in row.items()), flush=True)
+        known[part] = {"machine": here, "rows": rows}
+        out.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps(known, indent=1) + "\n")
+    write_page(out)
+
+
+def write_page(out):
+    """README.md: the tables of every machine."""
+    page = ["# Speed", "", "Made by `python results/bench.py`; what the rows mean stands in it."]
+    for path in sorted(out.glob("*.json")):
+        for part, found in json.loads(path.read_text()).items():
+            facts = ", ".join(f"{name} {value}" for name, value in found["machine"].items())
+            page += ["", f"## {path.stem}: {part}", "", f"{facts}.", "", table(found["rows"])]
+    (out / "README.md").write_text("\n".join(page) + "\n")
 
 
 if __name__ == "__main__":
-    main()
+    main(tyro.cli(Args, description=__doc__))

@@ -286,7 +286,7 @@ def test_parkour_rewards_by_hand(climb_up):
     want = {
         "position": 0.0,  # 1 - 0.5 * 2
         "heading": 0.0,  # too far
-        "direction": 2.0 / (2.0 + 0.1),
+        "approach": 2.0 / (2.0 + 0.1),
         "wait": 0.0,
         "stand": 0.0,
         "joint_vel": 81.0 + 400.0,

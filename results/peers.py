@@ -1,0 +1,123 @@
+"""What bench.py compares with: PPO of rsl_rl and of Brax. Runs in an environment of its own, which has those packages:
+
+    python3 -m venv .peers
+    .peers/bin/pip install -r requirements.txt -r requirements-peers.txt
+    .venv/bin/python results/bench.py --peers .peers/bin/python
+
+rsl_rl      its PPO in PyTorch on our go1_loco: the same physics, rewards, networks and minibatches
+playground  MuJoCo Playground's Go1JoystickFlatTerrain on MJX, learned by Brax PPO with Playground's own settings, but
+            for num_envs environments. Its meshes, which are only drawn, are replaced by a tetrahedron: they are not in
+            the package.
+"""
+
+import argparse
+import json
+import os
+import sys
+import time
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(ROOT))
+
+
+def our_env(task, num_envs):
+    """Our task as rsl_rl's VecEnv: arrays go to PyTorch and back without a copy where they can."""
+    import jax
+    import torch
+    from rsl_rl.env import VecEnv
+    from tensordict import TensorDict
+
+    import envs
+
+    env = envs.make(task, "c")
+    step = jax.jit(jax.vmap(env.step))
+
+    class Vectorised(VecEnv):
+        def __init__(self):
+            self.num_envs, self.num_actions, self.max_episode_length = num_envs, env.action_dim, env.episode_steps
+            self.device, self.cfg = "cpu", {}
+            self.episode_length_buf = torch.zeros(num_envs, dtype=torch.long)
+            self.state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), num_envs))
+
+        def get_observations(self):
+            return TensorDict({"policy": torch.from_dlpack(self.state.obs)}, batch_size=[num_envs])
+
+        def step(self, actions):
+            self.state = step(self.state, jax.dlpack.from_dlpack(actions.detach().contiguous()))
+            done = torch.from_dlpack(self.state.terminated | self.state.truncated).long()
+            extras = {"time_outs": torch.from_dlpack(self.state.truncated)}
+            return self.get_observations(), torch.from_dlpack(self.state.reward), done, extras
+
+    return Vectorised()
+
+
+def rsl_rl(task, num_envs, hidden, iterations):
+    """Steps per second of rsl_rl's runner on our environment, first iterations left out."""
+    from rsl_rl.runners import OnPolicyRunner
+
+    network = {"class_name": "MLPModel", "hidden_dims": hidden, "activation": "elu"}
+    config = {
+        "num_steps_per_env": 24,
+        "save_interval": 10**6,
+        "obs_groups": {"actor": ["policy"], "critic": ["policy"]},
+        "actor": network | {"distribution_cfg": {"class_name": "GaussianDistribution", "init_std": 1.0}},
+        "critic": dict(network),
+        "algorithm": {"class_name": "PPO", "num_learning_epochs": 5, "num_mini_batches": 4, "entropy_coef": 0.0},
+    }
+    runner = OnPolicyRunner(our_env(task, num_envs), config, log_dir=None, device="cpu")
+    runner.learn(3)
+    start = time.perf_counter()
+    runner.learn(iterations)
+    return num_envs * 24 * iterations / (time.perf_counter() - start)
+
+
+TETRAHEDRON = b"v 0 0 0\nv .1 0 0\nv 0 .1 0\nv 0 0 .1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+
+
+def playground(num_envs, steps):
+    """Steps per second of Brax PPO on Playground's Go1, compilation left out."""
+    from brax.training.agents.ppo import networks, train
+    from mujoco_playground import wrapper
+    from mujoco_playground._src.locomotion.go1 import base, joystick
+    from mujoco_playground.config import locomotion_params
+
+    name = "Go1JoystickFlatTerrain"
+    meshes = {f"{part}.stl": TETRAHEDRON for part in ("trunk", "hip", "thigh", "thigh_mirror", "calf")}
+    own = base.get_assets
+    base.get_assets = lambda: own() | meshes
+    config = joystick.default_config()
+    config.impl = "jax"
+    env = joystick.Joystick(task="flat_terrain", config=config)
+    ppo = dict(locomotion_params.brax_ppo_config(name, "jax"))
+    factory = ppo.pop("network_factory")
+    batch = num_envs * ppo["unroll_length"] // (ppo["num_minibatches"] * ppo["unroll_length"])
+    ppo |= {"num_envs": num_envs, "num_timesteps": steps, "num_evals": 2, "batch_size": max(1, batch)}
+    times = []
+    train.train(
+        env,
+        network_factory=lambda *a, **k: networks.make_ppo_networks(*a, **k, **dict(factory)),
+        wrap_env_fn=wrapper.wrap_for_brax_training,
+        run_evals=False,
+        progress_fn=lambda *_: times.append(time.perf_counter()),
+        **ppo,
+    )
+    return times
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("peer", choices=("rsl_rl", "playground"))
+    parser.add_argument("--num-envs", type=int, default=512)
+    parser.add_argument("--hidden", type=int, nargs="+", default=[128, 128, 128])
+    args = parser.parse_args()
+    if args.peer == "rsl_rl":
+        speed = rsl_rl("go1_loco", args.num_envs, args.hidden, 20)
+    else:
+        speed = playground(args.num_envs, args.num_envs * 20 * 4)
+    print(json.dumps(speed))
+
+
+if __name__ == "__main__":
+    os.environ.setdefault("JAX_PLATFORMS", "cpu")
+    main()
