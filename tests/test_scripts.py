@@ -154,6 +154,15 @@ def test_bad_arguments_are_refused(changes, words, tmp_path, refused):
     assert not (tmp_path / "run").exists()
 
 
+def test_out_of_memory_names_what_to_lower(tmp_path, refused, monkeypatch):
+    def full(*_):
+        raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 99 bytes.")
+
+    monkeypatch.setattr(script, "make_chunk", full)
+    args = dataclasses.replace(SMOKE, run_dir=str(tmp_path / "run"))
+    refused(script.main, args, "out of memory", "--num-envs", "allocating 99 bytes")
+
+
 def test_a_run_is_not_overwritten(trained):
     """In a process of its own: what a user sees of a refusal."""
     before = (trained[0] / "metrics.csv").read_bytes()

@@ -1,0 +1,33 @@
+"""The benchmark measures what it says, says why where it could not, and refuses what it does not know."""
+
+import json
+
+import pytest
+
+from results import bench
+
+
+def test_a_figure_of_a_process_of_its_own():
+    row = bench.in_process(120, "stepping", "go1_loco", "c", 4, False)
+    assert row["steps/s"] > 0 and row["compile s"] > 0 and 50 < row["MiB"] < 4000
+
+
+def test_what_could_not_be_measured_is_said():
+    assert "unknown task" in bench.in_process(120, "stepping", "go2_loco", "c", 4, False)["failed"]
+    assert bench.in_process(0.01, "stepping", "go1_loco", "c", 4, False)["failed"].startswith("did not end in")
+
+
+def test_page_has_every_row(tmp_path):
+    rows = [{"task": "go1_loco", "envs": 4, "steps/s": 12345.6}, {"task": "g1_loco", "failed": "did not end in 1 s"}]
+    (tmp_path / "cpu.json").write_text(json.dumps({"engines": {"machine": {"cores": 2}, "rows": rows}}))
+    bench.write_page(tmp_path)
+    lines = (tmp_path / "README.md").read_text().splitlines()
+    assert "| go1_loco | 4 | 12,346 |  |" in lines and "| g1_loco |  |  | did not end in 1 s |" in lines
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [({"tasks": ("go2_loco",)}, ["unknown task 'go2_loco'"]), ({"parts": ("peers",)}, ["--peers PYTHON", "peers.py"])],
+)
+def test_bad_arguments(changes, words, refused):
+    refused(bench.main, bench.Args(**changes), *words)
