@@ -157,7 +157,12 @@ class CEngine(Engine):
 
 
 class MjxEngine(Engine):
-    """MJX in JAX. It has no net-force contact sensors, so those are left out of its model and computed here."""
+    """MJX in JAX. It has no net-force contact sensors, so those are left out of its model and computed here.
+
+    It computes all contacts that any two geoms could have (beside slabs hundreds), solves the deepest `contacts` of them.
+    """
+
+    bounded = True
 
     def __init__(self, spec, decimation):
         super().__init__(spec, decimation)
@@ -172,6 +177,9 @@ class MjxEngine(Engine):
         spec = spec.copy()
         for sensor in [s for s in spec.sensors if s.type == mujoco.mjtSensor.mjSENS_CONTACT]:
             spec.delete(sensor)
+        geoms = np.sum((self.model.geom_contype > 0) & (self.model.geom_bodyid > 0))
+        self.contacts = 2 * int(geoms)  # a capsule that lies down touches at both ends; few lie at once
+        spec.add_numeric(name="max_contact_points", data=[self.contacts])
         mine = jax.local_devices()[0]  # its default is the first device of all, which may be another host's
         self.mjx_model = mjx.put_model(spec.compile(), device=mine, impl="jax")
         self.mjx_data = mjx.make_data(self.mjx_model, device=mine, impl="jax")
@@ -191,7 +199,9 @@ class MjxEngine(Engine):
         """Advance by `decimation` physics steps with joint targets ctrl (nu,) [rad]."""
         model, data = self.load(self.mjx_model, self.mjx_data, physics, ctrl)
         data = self.advance(model, data)
-        return self.measure(physics, model, data, self.net_forces(model, data))
+        depths = data._impl.contact.dist
+        overflow = jnp.all(depths < 0) & (len(depths) == self.contacts)  # there may have been more
+        return self.measure(physics, model, data, self.net_forces(model, data)).replace(overflow=overflow)
 
     def load(self, model, data, physics, ctrl):
         """The model with this simulation's randomised fields, the data at its state."""
@@ -239,14 +249,11 @@ class WarpEngine(MjxEngine):
     """
 
     many_devices = False  # its kernels take all simulations at once, on one device
-    bounded = True
 
     def __init__(self, spec, decimation):
         super().__init__(spec, decimation)
         if importlib.util.find_spec("warp") is None:
             raise ImportError("engine warp needs the package warp-lang: pip install -r requirements-gpu.txt")
-        geoms = np.sum((self.model.geom_contype > 0) & (self.model.geom_bodyid > 0))
-        self.contacts = 2 * int(geoms)  # a capsule that lies down touches at both ends; few lie at once
         self.rows = 4 * self.contacts + self.model.nu  # four sides of a friction pyramid, and joint limits
         self.plain_model = copy.copy(self.model)
         # it never resets by itself, and refuses the bit that says so

@@ -250,7 +250,7 @@ class Reporter:
     def show(self, row, speed):
         if row.get("overflow") and not self.warned:
             self.warned = True
-            print("warning: the engine had no room for some contacts; raise `contacts` of WarpEngine in envs/engine.py")
+            print("warning: the engine had no room for some contacts; raise `contacts` in envs/engine.py")
         shown = {name: row[name] for name in self.names if name in row}
         text = f"{row[self.over] / 1e6:.2f}M {self.over.removeprefix('env_')}  {speed:,.0f}/s  {line(shown)}"
         if self.bar:

@@ -47,8 +47,8 @@ def draw_levels(folder):
     ax.bar(level - 0.2, [float(last[name]) for name in names], 0.4, label="environments at the end of training")
     success = [result[f"level {i}"]["episode_success"] for i in level]
     ax.bar(level + 0.2, success, 0.4, label="success of the mean action")
-    ax.set(xlabel="level", xticks=level, ylim=(0, 1), title=folder.name)
-    ax.legend(fontsize=7)
+    ax.set(xlabel=f"level of {folder.name}", xticks=level, ylim=(0, 1))
+    fig.legend(fontsize=7, loc="outside upper center", ncols=2)
     ax.grid(alpha=0.3)
     fig.savefig(folder / "levels.png", dpi=110, metadata={"Software": None})
     plt.close(fig)
