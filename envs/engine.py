@@ -159,7 +159,7 @@ class CEngine(Engine):
 class MjxEngine(Engine):
     """MJX in JAX. It has no net-force contact sensors, so those are left out of its model and computed here.
 
-    It computes all contacts that any two geoms could have (beside slabs hundreds), solves the deepest `contacts` of them.
+    It computes all contacts that any two geoms could have, hundreds beside slabs, and solves the deepest of them.
     """
 
     bounded = True

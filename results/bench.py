@@ -8,11 +8,13 @@ engines   steps per second of the physics alone ("bare": random joint targets, a
           whole environment step ("env": engine, rewards, observations, resets), compile time and memory
 training  ppo_finetune.py with a task's preset, learning included, after compilation
 seeds     five seeds in one program against one seed
+solver    how far a limit on the contact solver's iterations moves a control step of an exploring robot
 peers     PPO of rsl_rl and Brax; see peers.py
 
 A part that is measured again replaces what stood there. Every figure comes from a process of its own.
 """
 
+import copy
 import csv
 import itertools
 import json
@@ -32,15 +34,24 @@ sys.path.insert(0, str(ROOT))
 
 import jax
 import mujoco
+import numpy as np
 import tyro
 
 import envs
 
 
+Part = Literal["engines", "training", "seeds", "solver", "peers"]
+
+
 @dataclass(frozen=True)
 class Args:
     tasks: tuple[str, ...] = tuple(envs.TASKS)
-    parts: tuple[Literal["engines", "training", "seeds", "peers"], ...] = ("engines", "training", "seeds")
+    parts: tuple[Literal["engines", "training", "seeds", "solver", "peers"], ...] = (
+        "engines",
+        "training",
+        "seeds",
+        "solver",
+    )
     engines: tuple[Literal["c", "mjx", "warp"], ...] = ("c", "mjx")
     counts: tuple[int, ...] = (256, 1024, 4096)  # environments; mjx and warp on a CPU: 64
     hidden: tuple[int, ...] | None = None  # widths of the trained MLP; None: the task's
@@ -144,6 +155,41 @@ def seed_rows(args):
         yield {"task": "go1_loco", "seeds": count} | row
 
 
+def solver_rows(args):
+    for task, limit in itertools.product(args.tasks, (4, 6, 10)):
+        yield {"task": task, "limit": limit} | in_process(args.limit_s, "solver", task, limit)
+
+
+def solver(task, limit, num_envs=64):
+    """One control step after 0.6 s of random actions, against the converged one.
+
+    The error is of qpos [m, rad] and of 0.02 s times qvel, the largest of a robot, its 90th percentile over robots.
+    """
+    env = envs.make(task, "c")
+    state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), num_envs))
+    step = jax.jit(jax.vmap(env.step))
+    actions = 0.6 * jax.random.normal(jax.random.key(1), (31, num_envs, env.action_dim))
+    for action in actions[:-1]:
+        state = step(state, action)
+    physics, ends, used = jax.device_get(state.physics), {}, []
+    for most in (limit, 100):
+        model = copy.copy(env.model)
+        model.opt.iterations = model.opt.ls_iterations = most
+        rows = []
+        for i, target in enumerate(np.asarray(env.default_pose + env.robot.action_scale * actions[-1])):
+            data = mujoco.MjData(model)
+            data.qpos[:], data.qvel[:], data.ctrl[:] = physics.qpos[i], physics.qvel[i], target
+            data.mocap_pos[:], data.mocap_quat[:] = physics.mocap_pos[i], physics.mocap_quat[i]
+            for _ in range(env.config.decimation):
+                mujoco.mj_step(model, data)
+                used += [int(data.solver_niter[0])] if most == limit else []
+            rows.append(np.concatenate([data.qpos, 0.02 * data.qvel]))
+        ends[most] = np.array(rows)
+    error = np.abs(ends[limit] - ends[100]).max(1)
+    at_limit = float(np.mean(np.array(used) >= limit))
+    return {"mean iterations": float(np.mean(used)), "at limit": at_limit, "error": float(np.quantile(error, 0.9))}
+
+
 def peer_rows(args):
     """Ours beside rsl_rl on the same physics and networks, and beside Playground with Brax; 512 environments."""
     for hidden in ((128, 128, 128), (512, 256, 128)):
@@ -161,7 +207,13 @@ def run_peer(args, words):
     return {"envs": 512} | json.loads(run.stdout.splitlines()[-1])
 
 
-ROWS = {"engines": engine_rows, "training": training_rows, "seeds": seed_rows, "peers": peer_rows}
+ROWS = {
+    "engines": engine_rows,
+    "training": training_rows,
+    "seeds": seed_rows,
+    "solver": solver_rows,
+    "peers": peer_rows,
+}
 
 
 def cpu_name():
@@ -187,7 +239,8 @@ def machine():
 
 def as_text(value):
     if isinstance(value, float):
-        return f"{value:,.{0 if abs(value) >= 100 else 2}f}"
+        digits = 0 if abs(value) >= 100 else 2
+        return f"{value:,.{digits}f}" if not 0 < abs(value) < 0.01 else f"{value:.1e}"
     return "-".join(map(str, value)) if isinstance(value, (list, tuple)) else str(value)
 
 
@@ -202,7 +255,7 @@ def table(rows):
 def main(args):
     if args.cell:
         what, *inputs = json.loads(args.cell)
-        print(json.dumps({"stepping": stepping, "training": training}[what](*inputs)))
+        print(json.dumps({"stepping": stepping, "training": training, "solver": solver}[what](*inputs)))
         return
     for name in {*args.tasks} - envs.TASKS.keys():
         print(f"error: unknown task {name!r}; known: {', '.join(envs.TASKS)}", file=sys.stderr)
