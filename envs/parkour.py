@@ -274,7 +274,7 @@ WEIGHTS = {
 }
 
 
-def parkour(skill, weights=(), **changes):
+def parkour(skill, weights=(), cpu_steps=12_000_000, **changes):
     """The config of a skill: what all skills share, with changes."""
     shared = {
         "robot": "anymal_d",
@@ -288,7 +288,7 @@ def parkour(skill, weights=(), **changes):
             "cpu": {
                 "num_envs": 512,
                 "num_steps": 48,
-                "total_steps": 12_000_000,
+                "total_steps": cpu_steps,
                 "hidden": (256, 128, 128),
                 "intention": (256, 128),
             },
@@ -311,6 +311,6 @@ def parkour(skill, weights=(), **changes):
 
 CLIMB_UP = parkour("climb_up", {"collision": -0.2}, base_force=100.0)
 CLIMB_DOWN = parkour("climb_down", foot_force=2000.0)
-CROUCH = parkour("crouch", base_force=100.0)
+CROUCH = parkour("crouch", cpu_steps=10_000_000, base_force=100.0)
 JUMP = parkour("jump", lowest_base=-0.3)
-WALK = parkour("walk", episode_seconds=8.0)
+WALK = parkour("walk", cpu_steps=10_000_000, episode_seconds=8.0)

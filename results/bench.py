@@ -39,7 +39,6 @@ import tyro
 
 import envs
 
-
 Part = Literal["engines", "training", "seeds", "solver", "peers"]
 
 
