@@ -60,6 +60,9 @@ class Args:
     hidden: tuple[int, ...] | None = None  # widths of the MLP's hidden layers
     intention: tuple[int, ...] | None = None  # of the PIDM's intention encoder but the last; None: as in pretraining
     init_std: float | None = None  # initial action std, in action units
+    # --- Warm start, beyond the paper ---
+    core_scale: float = 1.0  # multiplies the last layer of a loaded backbone, whose features are larger than fresh ones
+    warm_iterations: int = 0  # iterations in which the step size of loaded parts grows from 0
     # --- PPO (rsl_rl) ---
     num_epochs: int = 5  # passes over each rollout
     num_minibatches: int = 4  # B = N * T / num_minibatches
@@ -304,9 +307,27 @@ def warm_start(args, params, weights):
     params = jax.tree.map(lambda x: x, params)  # new dicts, so that the caller's stay as they are
     if args.init == "shuffled":
         weights = shuffle(weights, jax.random.fold_in(jax.random.key(args.seed), 1))
+    weights = jax.tree.map(jnp.asarray, weights)
+    layers = weights["backbone"]
+    last = max(layers)  # Dense_0, Dense_1, ...
+    weights |= {"backbone": layers | {last: jax.tree.map(lambda x: args.core_scale * x, layers[last])}}
     for branch in loaded_branches(args):
-        params["params"][branch] |= jax.tree.map(jnp.asarray, weights)
+        params["params"][branch] |= weights
     return params
+
+
+def make_optimizer(args):
+    """Adam, whose updates `update` multiplies by the step size; loaded parts may start slowly."""
+    steps = args.warm_iterations * args.num_epochs * args.num_minibatches
+    if not steps or not loaded_branches(args):
+        return optax.scale_by_adam()
+
+    def loaded(params):
+        branches = loaded_branches(args)
+        return jax.tree_util.tree_map_with_path(lambda p, _: p[1].key in branches and p[2].key in CORE, params)
+
+    slow = optax.scale_by_schedule(optax.linear_schedule(0.0, 1.0, steps))
+    return optax.chain(optax.scale_by_adam(), optax.masked(slow, loaded))
 
 
 def zero_inputs(env, net):
@@ -713,7 +734,7 @@ def train(args):
     """Run PPO to the end, or to Ctrl-C; either way each seed's folder holds a policy, the metrics and their curve."""
     env = make_env(args)
     args = merge(args, env.config.ppo)
-    net, opt, seeds = make_net(args, env), optax.scale_by_adam(), one_for_each_seed(args)
+    net, opt, seeds = make_net(args, env), make_optimizer(args), one_for_each_seed(args)
     states = [init_state(a, env, net, opt) for a in seeds]  # before a folder is touched: the checkpoint may be refused
     outs = records.start_runs(seeds, env.config, args.force) if devices.is_first() else [None] * len(seeds)
     print(f"{args.task}: observation {env.obs_dim}, action {env.action_dim}, engine {type(env.engine).__name__}")

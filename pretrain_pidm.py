@@ -45,6 +45,7 @@ class Args:
     num_samples: int | None = None  # train on this many transitions, drawn at random; None: all (paper: 7 M)
     noise: float = 1.0  # multiplies the tasks' sensor noise
     mirror: bool = True  # mirror half of the samples, for each symmetry of the robot
+    delta_steps: int = 1  # the wanted change of x is over so many control steps (paper: 1)
     # --- Training (ours; the paper gives the L1 loss and 100 epochs) ---
     epochs: int | None = None  # passes over the data
     batch: int | None = None  # B
@@ -62,7 +63,7 @@ def merge(args, robot):
     """Fill what is None in args from the preset; check the numbers."""
     values = PRESETS[args.preset] | {"run_dir": f"runs/pidm/{robot}/seed{args.seed}"}
     args = dataclasses.replace(args, **{name: v for name, v in values.items() if getattr(args, name) is None})
-    records.check_positive(args, ("epochs", "batch"))
+    records.check_positive(args, ("epochs", "batch", "delta_steps"))
     if args.batch % jax.device_count():
         raise records.UserError(f"--batch {args.batch} cannot be split over {jax.device_count()} devices")
     return args
@@ -153,9 +154,9 @@ class Dataset:
     its history; before an episode's start it is padded as `Env.reset` does: the first x repeated, actions zero.
     """
 
-    def __init__(self, folder):
+    def __init__(self, folder, delta_steps=1):
         """UserError if the collection is missing, unfinished, damaged or of an unknown robot."""
-        self.meta = read_meta(folder)
+        self.meta, self.delta_steps = read_meta(folder), delta_steps
         m = self.meta
         lead = m["iterations"] * m["num_steps"], m["num_envs"]
         self.x, self.action = (read_array(folder, name, m).reshape(*lead, -1) for name in ("x", "action"))
@@ -164,7 +165,7 @@ class Dataset:
         step = np.arange(lead[0], dtype=np.int32)[:, None]
         self.age = step - np.maximum.accumulate(np.where(first, step, 0))  # (S, N) steps since the episode's start
         usable = np.zeros(lead, bool)
-        usable[:-1] = ~first[1:]  # x_{t+1} of an episode's last step is not stored
+        usable[:-delta_steps] = self.age[delta_steps:] >= delta_steps  # x_{t+1} of an episode's last step is not stored
         held_out = np.zeros(lead[1], bool)
         held_out[m["validation_envs"]] = True
         self.train, self.validation = (np.flatnonzero(usable & envs) for envs in (~held_out, held_out))  # flat indices
@@ -183,7 +184,7 @@ class Dataset:
         return {
             "prop": self.x[np.maximum(rows, start[:, None]), env[:, None]],
             "past": past * (rows[:, :-1] >= start[:, None])[..., None],
-            "next_x": self.x[steps + 1, env],
+            "next_x": self.x[steps + self.delta_steps, env],
             "action": self.action[steps, env],
             "pad": pad,
         }
@@ -429,7 +430,7 @@ def checkpoint_meta(args, dataset, sizes, metrics):
 
 def pretrain(args):
     """Train, keep the weights of the best epoch, report and draw."""
-    dataset = Dataset(args.data)
+    dataset = Dataset(args.data, args.delta_steps)
     robot = dataset.meta["robot"]
     args, env = merge(args, robot), envs.make_explore(robot, "c")
     if dataset.meta["layout"] != list(env.prop_layout):

@@ -32,6 +32,8 @@ METHODS = {
     "pidm_shuffled": "PIDM shuffled",
     "pidm_actor": "PIDM pretrained, actor only",
     "pidm_critic": "PIDM pretrained, critic only",
+    "pidm_scaled": "PIDM pretrained, scaled",
+    "pidm_slow": "PIDM pretrained, slow start",
 }
 PAPER = {  # Table I: method -> task -> (final performance, iterations to 90 %), percent against PIDM random
     "mlp": {"go1_loco": (0.6, 2.2), "anymal_loco": (0.5, -28.7), "g1_loco": (-0.2, -46.7)},

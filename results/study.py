@@ -35,6 +35,9 @@ METHODS = {  # method -> arguments of ppo_finetune.py
     "pidm_shuffled": ("--pretrained", PIDM, "--init", "shuffled"),
     "pidm_actor": ("--pretrained", PIDM, "--init", "actor"),
     "pidm_critic": ("--pretrained", PIDM, "--init", "critic"),
+    # beyond the paper
+    "pidm_scaled": ("--pretrained", PIDM, "--core-scale", "0.5"),  # features as large as fresh ones
+    "pidm_slow": ("--pretrained", PIDM, "--warm-iterations", "50"),
 }
 KEPT = ("args.json", "metrics.csv", "eval.json")
 

@@ -1,5 +1,6 @@
 """Stage 2 and warm start: windows against a slow reference, mirrors and noise, what is loaded, what is refused."""
 
+import csv
 import dataclasses
 import json
 
@@ -197,6 +198,17 @@ def test_same_seed_same_weights(pretrained, tmp_path):
     jax.tree.map(np.testing.assert_array_equal, one, two)
 
 
+def test_wanted_change_over_several_steps(folder):
+    """next_x is x so many steps later in the same episode; transitions whose episode ends before are left out."""
+    one, three = script.Dataset(folder), script.Dataset(folder, delta_steps=3)
+    assert 0 < len(three.train) < len(one.train) and set(three.train) <= set(one.train)
+    count = one.x.shape[1]
+    got = three.windows(three.train)["next_x"]
+    np.testing.assert_array_equal(got, one.windows(three.train + 2 * count)["next_x"])
+    steps, env = np.divmod(three.train, count)
+    assert (one.age[steps + 3, env] == one.age[steps, env] + 3).all()
+
+
 # --- warm start ---
 
 
@@ -229,6 +241,23 @@ def test_shuffled_weights_keep_their_values_and_lose_their_place(pretrained):
         got, want = (p["backbone"]["Dense_1"]["kernel"] for p in (warm["params"][branch], pidm["params"]))
         np.testing.assert_array_equal(np.sort(np.ravel(got)), np.sort(np.ravel(want)))
         assert (np.asarray(got) == want).mean() < 0.01
+
+
+def test_loaded_parts_start_slowly_and_scaled(pretrained, tmp_path):
+    """With --warm-iterations far beyond the run loaded parts hardly move, all others do; --core-scale scales."""
+    path, out = pretrained / "pidm.msgpack", tmp_path / "run"
+    args = finetune.Args(preset="smoke", pretrained=str(path), init="actor", warm_iterations=10**6, core_scale=0.5)
+    params = finetune.main(dataclasses.replace(args, run_dir=str(out))).params["params"]
+    pidm, _ = records.load(path, "PIDM checkpoint")
+    for name, factor in (("history_encoder", 1.0), ("backbone", 0.5)):
+        last = max(pidm["params"][name])
+        want = factor * pidm["params"][name][last]["kernel"]
+        np.testing.assert_allclose(params["actor"][name][last]["kernel"][0], want, atol=1e-6)
+    row = list(csv.DictReader((out / "metrics.csv").open()))[-1]
+    for name, moved in row.items():
+        if name.startswith("update/"):
+            still = name in ("update/actor/history_encoder", "update/actor/backbone")
+            assert (float(moved) < 1e-7) == still, name
 
 
 @pytest.mark.parametrize("name", ["anymal_loco", "go1_loco", "g1_loco"])
