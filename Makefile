@@ -13,7 +13,7 @@ demo: .venv/installed
 test: .venv/installed
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	JAX_PLATFORMS=cpu $(BIN)/python -m pytest -q -n auto --dist loadfile tests
+	JAX_PLATFORMS=cpu $(BIN)/python -m pytest -q -n auto --dist loadfile --no-loadscope-reorder tests
 
 .venv/installed: requirements.txt
 	$(PYTHON) -m venv .venv

@@ -16,6 +16,7 @@ import os
 import time
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from typing import Literal
 
 import flax
@@ -43,6 +44,8 @@ class Args:
     engine: str = "auto"  # physics: c (CPU threads), mjx (accelerators), auto
     run_dir: str | None = None  # None: runs/explore/<robot>/seed<seed>
     force: bool = False  # overwrite the data in that folder
+    resume: str | None = None  # a run folder: go on where it stopped; all other arguments are those of that run
+    save_minutes: float = 2.0  # what --resume needs is written this often, and when interrupted
     log_every: int | None = None  # iterations per jitted chunk and CSV row
     # --- Data ---
     num_envs: int | None = None  # N
@@ -573,16 +576,35 @@ def init_state(args, env, net, opt, member, member_opt):
 # --- Dataset ---
 
 
-def create_files(out, args, env, iterations):
-    """Memory-mapped arrays (iterations, T, N, ...), their disk space reserved. UserError if the disk is too small."""
+def file_shapes(args, env, iterations):
+    """Shape and type of each array of the dataset, by name."""
     lead = (iterations, args.num_steps, args.num_envs)
-    shapes = {
+    return {
         "x": ((*lead, env.prop_dim), np.float32),
         "lin_vel": ((*lead, 3), np.float32),
         "action": ((*lead, env.action_dim), np.float32),
         "first": (lead, np.bool_),  # x_t opens an episode
         "rough": (lead, np.bool_),  # on rough ground
     }
+
+
+def open_files(out, args, env, iterations):
+    """The arrays of an interrupted collection, to go on writing. UserError if they are not as they were."""
+    files = {}
+    for name, (shape, dtype) in file_shapes(args, env, iterations).items():
+        try:
+            files[name] = np.load(out / f"{name}.npy", mmap_mode="r+", allow_pickle=False)
+            sane = files[name].shape == shape and files[name].dtype == dtype
+        except (OSError, ValueError, EOFError):
+            sane = False
+        if not sane:
+            raise records.UserError(f"{out}/{name}.npy is missing or damaged; start the collection again with --force")
+    return files
+
+
+def create_files(out, args, env, iterations):
+    """Memory-mapped arrays (iterations, T, N, ...), their disk space reserved. UserError if the disk is too small."""
+    shapes = file_shapes(args, env, iterations)
     (out / "meta.json").unlink(missing_ok=True)  # from here on the folder is an unfinished collection
     need = sum(int(np.prod(shape)) * np.dtype(dtype).itemsize for shape, dtype in shapes.values())
     try:
@@ -641,14 +663,13 @@ def explore(args):
     args = merge(args, env.config.ppo)
     chunks = -(-args.total_steps // (args.num_envs * args.num_steps * args.log_every))
     iterations = chunks * args.log_every
-    out = records.start_run(args, env.config, args.run_dir, args.force) if devices.is_first() else None
-    files = create_files(out, args, env, iterations) if out else {}
     print(f"{args.robot}: x {env.prop_dim}, action {env.action_dim}, engine {type(env.engine).__name__}")
-    print("  ".join(f"{name}={value}" for name, value in dataclasses.asdict(args).items()), flush=True)
     net = ActorCritic(args.hidden, env.action_dim, args.init_std)
     member = PIDM(MEMBER, 2 * env.action_dim)
     opt, member_opt = optax.scale_by_adam(), optax.adam(args.ensemble_lr)
     state = init_state(args, env, net, opt, member, member_opt)
+    state, rows, out, files = open_run(args, env, iterations, state)
+    print("  ".join(f"{name}={value}" for name, value in dataclasses.asdict(args).items()), flush=True)
     shardings = devices.of_state(state, axis=0)
     state = devices.place(state, shardings)
 
@@ -660,8 +681,32 @@ def explore(args):
     start = time.perf_counter()
     chunk = collect_chunk.lower(state).compile()
     print(f"compiled in {time.perf_counter() - start:.1f} s", flush=True)
-    start = last = time.perf_counter()
-    rows = []
+    state = fill(args, chunk, state, rows, out, files)
+    if int(state.iteration) < iterations:
+        print(f"interrupted: {args.run_dir} is an unfinished collection; --resume {args.run_dir} goes on with it")
+        return None
+    if out:
+        finish(out, args, env, iterations, files, rows)
+    return state
+
+
+def open_run(args, env, iterations, state):
+    """State to start from, rows so far, the run's folder and its arrays; on hosts other than the first no folder."""
+    if args.resume:
+        state, rows = records.load_state(args.resume, state)
+        out = Path(args.resume)
+        return state, rows, out, open_files(out, args, env, iterations)
+    if not devices.is_first():
+        return state, [], None, {}
+    out = records.start_run(args, env.config, args.run_dir, args.force)
+    return state, [], out, create_files(out, args, env, iterations)
+
+
+def fill(args, chunk, state, rows, out, files):
+    """Run chunks until the arrays are full or the user stops it; write data, rows and what --resume needs."""
+    last = saved = time.perf_counter()
+    start = last - (rows[-1]["seconds"] if rows else 0.0)
+    iterations = args.total_steps / (args.num_envs * args.num_steps)
     with records.Reporter(iterations, SHOWN) as reporter:
         while int(state.iteration) < iterations and not reporter.stopped:
             done = int(state.iteration)
@@ -677,11 +722,9 @@ def explore(args):
             last = now
             if not np.isfinite(row["disagreement"]):
                 raise records.UserError(f"disagreement is not finite after iteration {row['iteration']}; lower --lr")
-    if reporter.stopped:
-        print(f"interrupted: {out} is an unfinished collection; start it again with --force")
-        return None
-    if out:
-        finish(out, args, env, iterations, files, rows)
+            if now - saved >= 60 * args.save_minutes or reporter.stopped:
+                save(out, files, state, rows)
+                saved = now
     return state
 
 
@@ -690,8 +733,17 @@ def finish(out, args, env, iterations, files, rows):
     for file in files.values():
         file.flush()
     write_meta(out, args, env, iterations)
+    (out / records.STATE).unlink(missing_ok=True)  # as large as the ring buffer, and of no more use
     plot(rows, out / "curve.png")
     print(f"wrote {iterations * args.num_envs * args.num_steps} transitions to {out}")
+
+
+def save(out, files, state, rows):
+    """What --resume needs: the data first, then the state that knows how far they go. On several hosts nothing."""
+    if jax.process_count() == 1:
+        for file in files.values():
+            file.flush()
+        records.save_state(out, state, rows)
 
 
 def plot(rows, path):
@@ -705,7 +757,7 @@ def main(args):
     """Collect data. What a user can mend ends in one line and exit code 2."""
     with records.one_line_errors():
         devices.join(args.distributed)
-        return explore(args)
+        return explore(records.resumed(args) if args.resume else args)
 
 
 if __name__ == "__main__":

@@ -47,6 +47,8 @@ class Args:
     engine: str = "auto"  # physics: c (CPU threads), mjx (accelerators), auto
     run_dir: str | None = None  # None: runs/<task>/<method>/seed<seed>
     force: bool = False  # overwrite the run in that folder
+    resume: str | None = None  # a run folder: go on where it stopped; all other arguments are those of that run
+    save_minutes: float = 2.0  # what --resume needs is written this often, and at the end
     log_every: int | None = None  # iterations per jitted chunk and CSV row
     # --- Evaluation ---
     eval: str | None = None  # a policy.msgpack: run it instead of training, write pictures beside it
@@ -613,7 +615,7 @@ def one_for_each_seed(args):
     """The arguments of every training of this run: with --num-seeds their folders are `run_dir`/seed<k>."""
     seeds = range(args.seed, args.seed + args.num_seeds)
     folders = [args.run_dir if args.num_seeds == 1 else f"{args.run_dir}/seed{seed}" for seed in seeds]
-    return [dataclasses.replace(args, seed=s, run_dir=f) for s, f in zip(seeds, folders, strict=True)]
+    return [dataclasses.replace(args, seed=s, run_dir=f, num_seeds=1) for s, f in zip(seeds, folders, strict=True)]
 
 
 def make_chunk(args, env, net, opt, states):
@@ -731,12 +733,16 @@ def plot(rows, path):
 
 
 def train(args):
-    """Run PPO to the end, or to Ctrl-C; either way each seed's folder holds a policy, the metrics and their curve."""
+    """Run PPO to the end, or to Ctrl-C or SIGTERM; either way each seed's folder holds a policy, metrics and curve."""
     env = make_env(args)
     args = merge(args, env.config.ppo)
     net, opt, seeds = make_net(args, env), make_optimizer(args), one_for_each_seed(args)
-    states = [init_state(a, env, net, opt) for a in seeds]  # before a folder is touched: the checkpoint may be refused
-    outs = records.start_runs(seeds, env.config, args.force) if devices.is_first() else [None] * len(seeds)
+    states, rows = [init_state(a, env, net, opt) for a in seeds], [[] for _ in seeds]
+    if args.resume:
+        states[0], rows[0] = records.load_state(args.resume, states[0])
+        outs = [Path(args.resume)]
+    else:  # only now, for the checkpoint may have been refused
+        outs = records.start_runs(seeds, env.config, args.force) if devices.is_first() else [None] * len(seeds)
     print(f"{args.task}: observation {env.obs_dim}, action {env.action_dim}, engine {type(env.engine).__name__}")
     print("  ".join(f"{name}={value}" for name, value in dataclasses.asdict(args).items()), flush=True)
     if args.network == "pidm":
@@ -748,8 +754,8 @@ def train(args):
     start = time.perf_counter()
     chunk = make_chunk(args, env, net, opt, states).lower(states).compile()
     print(f"compiled in {time.perf_counter() - start:.1f} s", flush=True)
-    start = last = time.perf_counter()
-    rows = [[] for _ in seeds]
+    last = saved = time.perf_counter()
+    start = last - (rows[0][-1]["seconds"] if rows[0] else 0.0)
     with records.Reporter(iterations, SHOWN) as reporter:
         while int(states.iteration[0]) < iterations and not reporter.stopped:
             states, metrics = chunk(states)
@@ -758,8 +764,12 @@ def train(args):
             speed = args.num_seeds * args.log_every * args.num_envs * args.num_steps / (now - last)
             reporter.show(records.mean_row([own[-1] for own in rows]), speed)
             last = now
+            if now - saved >= 60 * args.save_minutes:
+                save_states(outs, states, rows)
+                saved = now
+    save_states(outs, states, rows)
     if reporter.stopped:
-        print("interrupted")
+        print(f"interrupted; --resume {' or '.join(a.run_dir for a in seeds)} goes on from here")
     for out, own in zip(outs, rows, strict=True) if devices.is_first() else ():
         plot(own, out / "curve.png")
         print(f"wrote {out}/policy.msgpack, metrics.csv, curve.png")
@@ -782,10 +792,17 @@ def keep(seeds, outs, states, metrics, rows, seconds):
             records.save(out / "policy.msgpack", params, {"task": args.task, "args": dataclasses.asdict(args)})
 
 
+def save_states(outs, states, rows):
+    """What --resume needs, into each seed's folder; on several hosts nobody has all of it, and none is written."""
+    for i, (out, own) in enumerate(zip(outs, rows, strict=True)) if jax.process_count() == 1 else ():
+        records.save_state(out, jax.tree.map(lambda x, i=i: x[i], states), own)
+
+
 def main(args):
     """Train, or evaluate with --eval. What a user can mend ends in one line and exit code 2."""
     with records.one_line_errors():
         devices.join(args.distributed)
+        args = records.resumed(args) if args.resume else args
         return run_eval(args) if args.eval else train(args)
 
 

@@ -40,6 +40,7 @@ class Args:
     seed: int = 0  # the only source of randomness
     run_dir: str | None = None  # None: runs/pidm/<robot>/seed<seed>
     force: bool = False  # overwrite the run in that folder
+    resume: str | None = None  # a run folder: go on after its last epoch; all other arguments are those of that run
     distributed: bool = False  # one of several processes, one a host; process 0 writes the files
     # --- Data ---
     num_samples: int | None = None  # train on this many transitions, drawn at random; None: all (paper: 7 M)
@@ -443,7 +444,6 @@ def pretrain(args):
     if not 1 <= count <= len(dataset.train):
         raise records.UserError(f"--num-samples {count} is not within 1 and the {len(dataset.train)} in {args.data}")
     order = np.random.default_rng(args.seed).permutation(dataset.train)[:count]
-    out = records.start_run(args, env.config, args.run_dir, args.force) if devices.is_first() else None
     print(f"{robot}: {count} transitions to train on, {len(dataset.validation)} to validate")
     print("  ".join(f"{name}={value}" for name, value in dataclasses.asdict(args).items()), flush=True)
 
@@ -454,17 +454,22 @@ def pretrain(args):
     variables = net.init(k_init, jnp.zeros(history), jnp.zeros(env.prop_dim)) | {"normalizer": norm}
     opt = optax.adam(optax.cosine_decay_schedule(args.lr, args.epochs * max(count // args.batch, 1)))
     step, carry = make_step(args, env, net, opt), (variables, opt.init(variables["params"]))
+    rows, out = [], Path(args.run_dir) if devices.is_first() else None
+    if args.resume:
+        carry, rows = records.load_state(args.resume, carry)
+    elif out:
+        records.start_run(args, env.config, args.run_dir, args.force)
     carry = devices.place(carry, jax.tree.map(lambda _: devices.same(), carry))
 
-    rows = run_epochs(args, env, net, dataset, order, step, carry, out)
+    run_epochs(args, env, net, dataset, order, step, carry, out, rows)
     if out:
         report(args, env, net, dataset, rows, out)
 
 
-def run_epochs(args, env, net, dataset, order, step, carry, out):
-    """All epochs; keeps the weights with the least error on (at most 50,000) validation transitions. Returns rows."""
+def run_epochs(args, env, net, dataset, order, step, carry, out, rows):
+    """All epochs that `rows` lacks. Keeps the weights with the least error on at most 50,000 validation transitions."""
     few = np.sort(np.random.default_rng(args.seed).permutation(dataset.validation)[:50_000])
-    rows, start, best = [], time.perf_counter(), np.inf
+    start = time.perf_counter() - (rows[-1]["seconds"] if rows else 0.0)
     names = ("train_error", "error", "normalized_error", "last_action_error")
     with records.Reporter(args.epochs, names, over="samples") as reporter:
         while len(rows) < args.epochs and not reporter.stopped:
@@ -480,13 +485,12 @@ def run_epochs(args, env, net, dataset, order, step, carry, out):
             reporter.show(rows[-1], speed)
             if not np.isfinite(loss):
                 raise records.UserError(f"the error is not finite after epoch {len(rows)}; lower --lr")
-            if metrics["error"] < best:
-                best = metrics["error"]
-                if out:
-                    records.save(out / "pidm.msgpack", carry[0], checkpoint_meta(args, dataset, net.sizes, rows[-1]))
+            if out and rows[-1]["error"] <= min(row["error"] for row in rows):
+                records.save(out / "pidm.msgpack", carry[0], checkpoint_meta(args, dataset, net.sizes, rows[-1]))
+            if out:
+                records.save_state(out, carry, rows)
     if reporter.stopped:
-        print("interrupted")
-    return rows
+        print(f"interrupted; --resume {args.run_dir} goes on from here")
 
 
 def report(args, env, net, dataset, rows, out):
@@ -506,7 +510,7 @@ def main(args):
     """Train a PIDM. What a user can mend ends in one line and exit code 2."""
     with records.one_line_errors():
         devices.join(args.distributed)
-        return pretrain(args)
+        return pretrain(records.resumed(args) if args.resume else args)
 
 
 if __name__ == "__main__":

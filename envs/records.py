@@ -20,6 +20,7 @@ import flax
 import jax
 import jax.numpy as jnp
 import mujoco
+import numpy as np
 
 
 class UserError(Exception):
@@ -115,7 +116,8 @@ def start_run(args, config, folder, force):
     record = dataclasses.asdict(args) | {"config": dataclasses.asdict(config), "versions": versions()}
     try:
         out.mkdir(parents=True, exist_ok=True)
-        (out / "metrics.csv").unlink(missing_ok=True)
+        for name in ("metrics.csv", STATE):
+            (out / name).unlink(missing_ok=True)
         replace_text(out / "args.json", json.dumps(record, indent=1) + "\n")
     except OSError as error:
         raise UserError(f"cannot write to {out}: {error.strerror}") from None
@@ -150,6 +152,56 @@ def load(path, kind):
     if not KINDS[kind] <= meta.keys():
         raise UserError(f"{path} is not a {kind}; it holds {', '.join(sorted(meta))}")
     return params, meta
+
+
+STATE = "state.msgpack"  # in a run folder: what --resume goes on from
+
+
+def save_state(out, state, rows):
+    """Write all that a run needs to go on to the same bits, and its rows so far, in one step."""
+    leaves = jax.device_get([jax.random.key_data(x) if is_key(x) else x for x in jax.tree.leaves(state)])
+    blob = flax.serialization.msgpack_serialize(
+        {"leaves": {str(i): np.asarray(x) for i, x in enumerate(leaves)}, "rows": json.dumps(rows)}
+    )
+    tmp = out / (STATE + ".tmp")
+    tmp.write_bytes(blob)
+    tmp.replace(out / STATE)
+
+
+def load_state(folder, like):
+    """State and rows that `save_state` wrote; UserError if there are none, or if the state is not one like `like`."""
+    path = Path(folder) / STATE
+    wanted, structure = jax.tree.flatten(like)
+    try:
+        content = flax.serialization.msgpack_restore(path.read_bytes())
+        leaves, rows = [content["leaves"][str(i)] for i in range(len(wanted))], json.loads(content["rows"])
+        leaves = [jax.random.wrap_key_data(x) if is_key(w) else x for x, w in zip(leaves, wanted, strict=True)]
+        same = all(x.shape == w.shape and x.dtype == w.dtype for x, w in zip(leaves, wanted, strict=True))
+    except OSError as error:
+        raise UserError(f"cannot resume from {path}: {error.strerror}") from None
+    except Exception:  # msgpack has no common error class; whatever it says, the file is not ours
+        raise UserError(f"{path} is damaged; start the run again with --force") from None
+    if not same:
+        raise UserError(f"{path} was written by other code or settings than these; start the run again with --force")
+    return structure.unflatten(leaves), rows
+
+
+def is_key(x):
+    return jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
+
+
+def resumed(args):
+    """The arguments of the run in the folder args.resume, which goes on there. UserError if it holds none."""
+    path = Path(args.resume) / "args.json"
+    try:
+        record = json.loads(path.read_text())
+        names = [field.name for field in dataclasses.fields(args) if field.name in record]
+        found = type(args)(**{n: tuple(record[n]) if isinstance(record[n], list) else record[n] for n in names})
+    except OSError as error:
+        raise UserError(f"cannot resume from {path}: {error.strerror}") from None
+    except (ValueError, TypeError):
+        raise UserError(f"{path} is damaged; start the run again") from None
+    return dataclasses.replace(found, resume=args.resume, run_dir=args.resume, force=False)
 
 
 def check_shapes(path, params, like):
@@ -221,7 +273,7 @@ def plot_curves(rows, names, groups, path, over="env_steps"):
 
 
 class Reporter:
-    """Progress: a live bar on a terminal, one plain line a row elsewhere. Ctrl-C sets `stopped`, to end after a row."""
+    """Progress: a live bar on a terminal, else a line a row. Ctrl-C and SIGTERM set `stopped`, to end after a row."""
 
     def __init__(self, total, names, over="env_steps"):
         """total: iterations of the run; names: the columns to show; over: the column that counts the work done."""
@@ -232,7 +284,7 @@ class Reporter:
         self.stopped = True  # an exception could strike inside the physics callback
 
     def __enter__(self):
-        self.handler = signal.signal(signal.SIGINT, self.stop)
+        self.handlers = {sign: signal.signal(sign, self.stop) for sign in (signal.SIGINT, signal.SIGTERM)}
         if sys.stdout.isatty():
             from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -243,7 +295,8 @@ class Reporter:
         return self
 
     def __exit__(self, *_):
-        signal.signal(signal.SIGINT, self.handler)
+        for sign, handler in self.handlers.items():
+            signal.signal(sign, handler)
         if self.bar:
             self.bar.stop()
 

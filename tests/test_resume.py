@@ -1,0 +1,93 @@
+"""A run that stops anywhere and is resumed ends with the same bits as one that was not; bad states are refused."""
+
+import csv
+import dataclasses
+import functools
+import json
+import shutil
+
+import flax
+import jax
+import numpy as np
+import pytest
+
+import ppo_explore
+import ppo_finetune
+import pretrain_pidm
+from envs import records
+
+RESULT = {ppo_explore: "action.npy", pretrain_pidm: "pidm.msgpack", ppo_finetune: "policy.msgpack"}
+
+
+class Interrupted(records.Reporter):
+    """As if Ctrl-C came during the first row."""
+
+    def show(self, row, speed):
+        super().show(row, speed)
+        self.stopped = True
+
+
+def rows_of(folder):
+    """metrics.csv without what depends on the clock."""
+    with (folder / "metrics.csv").open() as file:
+        return [{k: v for k, v in row.items() if k != "seconds"} for row in csv.DictReader(file)]
+
+
+def weights_of(path):
+    """Everything in a result file but what names the run."""
+    if path.suffix == ".npy":
+        return {name: np.load(path.with_name(f"{name}.npy")) for name in ("x", "lin_vel", "action", "first", "rough")}
+    return flax.serialization.msgpack_restore(path.read_bytes())["params"]
+
+
+@pytest.fixture(scope="module")
+def collection(tmp_path_factory):
+    out = tmp_path_factory.mktemp("resume") / "data"
+    ppo_explore.main(ppo_explore.Args(preset="smoke", run_dir=str(out)))
+    return out
+
+
+@pytest.fixture(scope="module")
+def whole(collection, tmp_path_factory):
+    """whole(script): folder of a finished run and its arguments, cached."""
+
+    @functools.cache
+    def run(script):
+        changes = {"data": str(collection)} if script is pretrain_pidm else {}
+        out = tmp_path_factory.mktemp("whole") / "run"
+        args = script.Args(preset="smoke", seed=3, run_dir=str(out), **changes)
+        script.main(args)
+        return out, args
+
+    return run
+
+
+@pytest.mark.parametrize("script", RESULT, ids=lambda script: script.__name__)
+def test_resumed_run_has_the_same_bits(script, whole, tmp_path, monkeypatch):
+    want, args = whole(script)
+    broken = tmp_path / "broken"
+    with monkeypatch.context() as patch:
+        patch.setattr(records, "Reporter", Interrupted)
+        script.main(dataclasses.replace(args, run_dir=str(broken)))
+    assert len(rows_of(broken)) == 1 < len(rows_of(want))
+    script.main(script.Args(resume=str(broken)))
+    assert rows_of(broken) == rows_of(want)
+    jax.tree.map(np.testing.assert_array_equal, *(weights_of(folder / RESULT[script]) for folder in (want, broken)))
+
+
+def test_what_cannot_be_resumed_is_refused(whole, tmp_path, refused):
+    def check(*words, folder=tmp_path / "run"):
+        refused(ppo_finetune.main, ppo_finetune.Args(resume=str(folder)), *words)
+
+    check("cannot resume from", "No such file", folder=tmp_path / "none")
+    out = tmp_path / "run"
+    shutil.copytree(whole(ppo_finetune)[0], out)
+    record, state = json.loads((out / "args.json").read_text()), (out / records.STATE).read_bytes()
+    (out / records.STATE).write_bytes(state[:-50])
+    check("is damaged")
+    (out / records.STATE).write_bytes(state)
+    (out / "args.json").write_text(json.dumps(record | {"num_envs": 8}))
+    check("other code or settings")
+    (out / "args.json").write_text("{")
+    check("args.json is damaged")
+    assert (out / records.STATE).read_bytes() == state
