@@ -117,8 +117,8 @@ def test_study_table_is_what_was_recorded():
         assert set(row) <= set(known), row
 
 
-def test_speed_table_is_what_was_measured():
+def test_speed_tables_are_what_was_measured():
     section = README.split("## Speed")[1].split("\n## ")[0]
-    rows = [line for line in section.splitlines() if line.endswith((" steps/s |", " x |", " s |"))]
+    rows = [line for line in section.splitlines() if line.startswith("|")]
     measured = (ROOT / "results/bench/README.md").read_text().splitlines()
     assert len(rows) > 5 and set(rows) <= set(measured)
