@@ -81,6 +81,13 @@ def test_task_table_is_what_was_recorded(task):
     assert row.endswith(f"| {scale} | {minutes}, {result} |")
 
 
+@pytest.mark.parametrize("task", [task for task in RECORDED if "skill" in dir(envs.TASKS[task][1])])
+def test_success_table_is_what_was_recorded(task):
+    report = json.loads((ROOT / "results/tasks" / task / "eval.json").read_text())
+    row = [f"{100 * report[f'level {level}']['episode_success']:.0f}" for level in range(10)]
+    assert f"| `{task}` | {' | '.join(row)} |" in README.splitlines()
+
+
 def test_demo_is_what_was_recorded():
     run = ROOT / "results/tasks/demo"
     result = json.loads((run / "eval.json").read_text())["task"]
