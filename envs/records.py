@@ -64,11 +64,25 @@ def cpu_count():
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
 
 
-def replace_text(path, text):
-    """Write a whole text file in one step."""
+def replace_bytes(path, blob):
+    """Write a whole file in one step: after a crash or a loss of power the old or the new one is there, whole.
+
+    UserError if it cannot be written; the old one stays.
+    """
     tmp = path.with_name(path.name + ".tmp")
-    tmp.write_text(text)
-    tmp.replace(path)
+    try:
+        with tmp.open("wb") as file:
+            file.write(blob)
+            file.flush()
+            os.fsync(file.fileno())
+        tmp.replace(path)
+    except OSError as error:
+        tmp.unlink(missing_ok=True)
+        raise UserError(f"cannot write {path}: {error.strerror}; the files of the last row are untouched") from None
+
+
+def replace_text(path, text):
+    replace_bytes(path, text.encode())
 
 
 def check_positive(args, names):
@@ -132,9 +146,7 @@ def save(path, params, meta):
             "meta": json.dumps(meta | {"versions": versions()}),
         }
     )
-    tmp = path.with_name(path.name + ".tmp")
-    tmp.write_bytes(blob)
-    tmp.replace(path)
+    replace_bytes(path, blob)
 
 
 KINDS = {"policy": {"task", "args"}, "PIDM checkpoint": {"robot", "layout", "history"}}  # and what their meta holds
@@ -163,9 +175,7 @@ def save_state(out, state, rows):
     blob = flax.serialization.msgpack_serialize(
         {"leaves": {str(i): np.asarray(x) for i, x in enumerate(leaves)}, "rows": json.dumps(rows)}
     )
-    tmp = out / (STATE + ".tmp")
-    tmp.write_bytes(blob)
-    tmp.replace(out / STATE)
+    replace_bytes(out / STATE, blob)
 
 
 def load_state(folder, like):

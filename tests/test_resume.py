@@ -2,8 +2,10 @@
 
 import csv
 import dataclasses
+import errno
 import functools
 import json
+import os
 import shutil
 
 import flax
@@ -73,6 +75,27 @@ def test_resumed_run_has_the_same_bits(script, whole, tmp_path, monkeypatch):
     script.main(script.Args(resume=str(broken)))
     assert rows_of(broken) == rows_of(want)
     jax.tree.map(np.testing.assert_array_equal, *(weights_of(folder / RESULT[script]) for folder in (want, broken)))
+
+
+def test_full_disk_ends_in_one_line_and_loses_nothing(whole, tmp_path, refused, monkeypatch):
+    """The disk is full when the second row is written: one line; with room again --resume ends with the same bits."""
+    want, args = whole(ppo_finetune)
+    out, synced, sync = tmp_path / "full", [], os.fsync
+
+    def full(file):
+        synced.append(file)
+        if len(synced) > 4:  # args.json; then metrics.csv, policy.msgpack and state.msgpack of the first row
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        sync(file)
+
+    monkeypatch.setattr(os, "fsync", full)
+    broken = dataclasses.replace(args, run_dir=str(out), save_minutes=0.0)
+    refused(ppo_finetune.main, broken, "cannot write", "No space left on device")
+    assert len(rows_of(out)) == 1 and not list(out.glob("*.tmp"))
+    monkeypatch.setattr(os, "fsync", sync)
+    ppo_finetune.main(ppo_finetune.Args(resume=str(out)))
+    assert rows_of(out) == rows_of(want)
+    jax.tree.map(np.testing.assert_array_equal, *(weights_of(f / "policy.msgpack") for f in (want, out)))
 
 
 def test_what_cannot_be_resumed_is_refused(whole, tmp_path, refused):
