@@ -99,9 +99,10 @@ def slab_scene(robot, slabs, floor=0.0, visual=False):
             conaffinity=1,
             rgba=[0.3, 0.45, 0.6, 0.6] if slab.ceiling else colours[i % 2],
         )
-    if visual:  # from outside of the slabs
-        camera = spec.camera("track")
-        camera.pos, camera.alt.xyaxes = [0.6, -4.0, 1.8], [1, 0, 0, 0, 0.39, 0.92]
+    if visual:  # from outside of the slabs; where one hangs overhead, from below it
+        camera, below = spec.camera("track"), any(slab.ceiling for slab in slabs)
+        camera.pos = [0.6, -4.0, 0.0 if below else 1.8]
+        camera.alt.xyaxes = [1, 0, 0, 0, 0, 1] if below else [1, 0, 0, 0, 0.39, 0.92]
     return spec
 
 

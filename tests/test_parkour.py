@@ -258,7 +258,7 @@ def test_foot_force_and_base_contact_end_an_episode(jitted):
 
     foot = jnp.zeros((4, 3)).at[2, 2]
     sensors = motion.sensors.at[env.ends[0]]
-    assert not ends(foot_force=foot.set(990.0)) and ends(foot_force=foot.set(1010.0))
+    assert not ends(foot_force=foot.set(1990.0)) and ends(foot_force=foot.set(2010.0))
     assert not ends(sensors=sensors.set(0.5)) and ends(sensors=sensors.set(2.0))
 
 
