@@ -31,7 +31,7 @@ class ParkourConfig(Config):
     scan_shift: float = 0.075  # [m] half-width of a shift of the whole map, per episode
     random_seconds: float = 2.0  # episodes are shorter by up to this
     base_force: float = 1.0  # [N] on the base is a failure
-    foot_force: float = 3000.0  # [N] on a foot is a failure; exploring alone exceeds 1500 in a step of 1000
+    foot_force: float = 3000.0  # [N] on a foot is a failure
     velocity_limit: float = 8.5  # [rad/s] of the joints; ANYmal D's URDF
     lowest_base: float = -1e3  # [m] a base below this is a failure (fallen into the pit)
 

@@ -115,7 +115,7 @@ def main():
         speed = rsl_rl("go1_loco", args.num_envs, args.hidden, 20)
     else:
         speed = playground(args.num_envs, args.num_envs * 20 * 4)
-    print(json.dumps(speed))
+    print(json.dumps({"steps/s": speed}))
 
 
 if __name__ == "__main__":

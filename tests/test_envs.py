@@ -225,6 +225,8 @@ def test_pushes(jitted):
 @pytest.mark.parametrize("engine", ENGINES)
 def test_randomised_fields_reach_the_engine(engine):
     """Heavier robots press harder, slippery ones slide, wrenches push: the same on every engine."""
+    if engine == "warp":
+        pytest.importorskip("warp")
     env = envs.make("go1_loco", engine, noise=0.0, spawn_xy=0.0, spawn_yaw=0.0, added_mass=(0.0, 0.0))
     one = spawn(env)(jax.random.key(0))
     trunk = env.model.body("trunk").id
