@@ -13,6 +13,7 @@ playground  MuJoCo Playground's Go1JoystickFlatTerrain on MJX, learned by Brax P
 import argparse
 import json
 import os
+import struct
 import sys
 import time
 from pathlib import Path
@@ -72,18 +73,25 @@ def rsl_rl(task, num_envs, hidden, iterations):
     return num_envs * 24 * iterations / (time.perf_counter() - start)
 
 
-TETRAHEDRON = b"v 0 0 0\nv .1 0 0\nv 0 .1 0\nv 0 0 .1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+def tetrahedron():
+    """Four triangles as a binary STL file: 80 bytes of header, a count, and normal, corners and a word each."""
+    corners = ((0, 0, 0), (0.1, 0, 0), (0, 0.1, 0), (0, 0, 0.1))
+    faces = [[(0, 0, 0), *(corners[i] for i in face)] for face in ((0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3))]
+    return bytes(80) + struct.pack("<I", 4) + b"".join(struct.pack("<12fH", *sum(face, ()), 0) for face in faces)
 
 
-def playground(num_envs, steps):
-    """Steps per second of Brax PPO on Playground's Go1, compilation left out."""
+def playground(num_envs):
+    """Steps per second of Brax PPO on Playground's Go1: of the second of two iterations, which compiles nothing."""
+    import jax
     from brax.training.agents.ppo import networks, train
     from mujoco_playground import wrapper
     from mujoco_playground._src.locomotion.go1 import base, joystick
     from mujoco_playground.config import locomotion_params
 
+    # Brax 0.14.2 calls what JAX 0.10 no longer has; one device is all there is
+    jax.device_put_replicated = lambda tree, devices: jax.tree.map(lambda x: jax.numpy.asarray(x)[None], tree)
     name = "Go1JoystickFlatTerrain"
-    meshes = {f"{part}.stl": TETRAHEDRON for part in ("trunk", "hip", "thigh", "thigh_mirror", "calf")}
+    meshes = {f"{part}.stl": tetrahedron() for part in ("trunk", "hip", "thigh", "thigh_mirror", "calf")}
     own = base.get_assets
     base.get_assets = lambda: own() | meshes
     config = joystick.default_config()
@@ -91,18 +99,19 @@ def playground(num_envs, steps):
     env = joystick.Joystick(task="flat_terrain", config=config)
     ppo = dict(locomotion_params.brax_ppo_config(name, "jax"))
     factory = ppo.pop("network_factory")
-    batch = num_envs * ppo["unroll_length"] // (ppo["num_minibatches"] * ppo["unroll_length"])
-    ppo |= {"num_envs": num_envs, "num_timesteps": steps, "num_evals": 2, "batch_size": max(1, batch)}
-    times = []
+    iteration = num_envs * ppo["unroll_length"]
+    ppo |= {"num_envs": num_envs, "batch_size": num_envs // ppo["num_minibatches"]}
+    ppo |= {"num_timesteps": 2 * iteration, "num_evals": 3}
+    speeds = []
     train.train(
         env,
         network_factory=lambda *a, **k: networks.make_ppo_networks(*a, **k, **dict(factory)),
         wrap_env_fn=wrapper.wrap_for_brax_training,
         run_evals=False,
-        progress_fn=lambda *_: times.append(time.perf_counter()),
+        progress_fn=lambda _, metrics: speeds.append(metrics["training/sps"]),
         **ppo,
     )
-    return times
+    return float(speeds[-1])
 
 
 def main():
@@ -111,10 +120,8 @@ def main():
     parser.add_argument("--num-envs", type=int, default=512)
     parser.add_argument("--hidden", type=int, nargs="+", default=[128, 128, 128])
     args = parser.parse_args()
-    if args.peer == "rsl_rl":
-        speed = rsl_rl("go1_loco", args.num_envs, args.hidden, 20)
-    else:
-        speed = playground(args.num_envs, args.num_envs * 20 * 4)
+    ours = args.peer == "rsl_rl"
+    speed = rsl_rl("go1_loco", args.num_envs, args.hidden, 20) if ours else playground(args.num_envs)
     print(json.dumps({"steps/s": speed}))
 
 

@@ -2,8 +2,10 @@
 
     python results/pidm.py --robots go1 anymal_d g1
     python results/pidm.py --robots go1 --stages look
+    python results/pidm.py --robots anymal_d --stages sizes
 
-Weights go to assets/pidm/<robot>.msgpack, everything else to results/pidm/<robot>.
+Weights go to assets/pidm/<robot>.msgpack, everything else to results/pidm/<robot>. Stage `sizes` pretrains on small
+random parts of the data as well (paper Fig. 5); its weights and errors go to results/pidm/<robot>/sizes.
 """
 
 import json
@@ -28,6 +30,7 @@ import ppo_finetune
 import pretrain_pidm
 from envs import records
 
+SIZES = (7_000, 70_000, 700_000)  # transitions
 EARLY = 100  # iterations of a task's training whose states the coverage figure shows (paper Fig. 4a)
 
 
@@ -35,7 +38,7 @@ EARLY = 100  # iterations of a task's training whose states the coverage figure 
 class Args:
     robots: tuple[str, ...] = ("go1", "anymal_d", "g1")
     preset: Literal["smoke", "cpu", "gpu"] = "cpu"
-    stages: tuple[Literal["collect", "pretrain", "look"], ...] = ("collect", "pretrain", "look")
+    stages: tuple[Literal["collect", "pretrain", "look", "sizes"], ...] = ("collect", "pretrain", "look")
 
 
 def run(*words):
@@ -55,6 +58,19 @@ def keep(robot):
         shutil.copy(trained / name, kept / name)
     (ROOT / "assets/pidm").mkdir(exist_ok=True)
     shutil.copy(trained / "pidm.msgpack", ROOT / f"assets/pidm/{robot}.msgpack")
+
+
+def pretrain_on_parts(args, robot):
+    """Weights and validation error for each of SIZES, in files of that name."""
+    kept = ROOT / f"results/pidm/{robot}/sizes"
+    kept.mkdir(parents=True, exist_ok=True)
+    for size in SIZES:
+        folder = f"runs/pidm/{robot}/{size}"
+        words = ("--data", f"runs/explore/{robot}/seed0", "--num-samples", str(size), "--run-dir", folder)
+        run("pretrain_pidm.py", *words, "--preset", args.preset, "--force")
+        for name, suffix in (("pidm", "msgpack"), ("validation", "json"), ("metrics", "csv"), ("args", "json")):
+            stem = str(size) if name == "pidm" else f"{size}_{name}"
+            shutil.copy(ROOT / folder / f"{name}.{suffix}", kept / f"{stem}.{suffix}")
 
 
 def sample(folder, count=20_000):
@@ -260,6 +276,8 @@ def main(args):
             keep(robot)
         if "look" in args.stages:
             look(args, robot)
+        if "sizes" in args.stages:
+            pretrain_on_parts(args, robot)
     write_readme()
 
 

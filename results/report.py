@@ -1,13 +1,14 @@
-"""Turn the recorded runs under results/study into tables and curves: results/study/README.md and curves.png.
+"""Turn the runs under results/study into the paper's tables and figures: results/README.md, and the project's README.
 
     python results/report.py
     python results/report.py --check
     python results/report.py --beside runs/demo
 
-Metrics are the paper's: final performance (mean return of the last 5% of rows) and iterations to 90% of the final
-performance of PIDM random, both against PIDM random; beside them iterations to 50%, area under the curve, and return
-and velocity error of the mean action. Intervals are 95% bootstrap intervals over seeds. --check fails if the README is
-not what the runs give; --beside draws a run of yours with the recorded ones of its task.
+The indicator of a task is the paper's: mean return of the noisy policy, for parkour the curriculum's progress. Final
+performance is its mean over the last 5% of rows; iterations to converge, the first at which it reaches 90% of PIDM
+random's final performance; both are percentages against PIDM random. Brackets are 95% bootstrap intervals over seeds.
+--check fails if a page on disk is not what the runs give; --beside draws a run of yours with the recorded ones of its
+task.
 """
 
 import csv
@@ -25,6 +26,17 @@ sys.path.insert(0, str(ROOT))
 from envs import records
 
 STUDY = ROOT / "results/study"
+TASKS = {  # in the paper's order
+    "anymal_loco": "ANYmal D locomotion",
+    "anymal_pedipulation": "Pedipulation",
+    "anymal_parkour_walk": "Parkour walk",
+    "anymal_climb_up": "Climb up",
+    "anymal_climb_down": "Climb down",
+    "anymal_crouch": "Crouch",
+    "anymal_jump": "Jump",
+    "go1_loco": "Go1 locomotion",
+    "g1_loco": "G1 locomotion",
+}
 METHODS = {
     "mlp": "MLP",
     "pidm_random": "PIDM random",
@@ -32,49 +44,65 @@ METHODS = {
     "pidm_shuffled": "PIDM shuffled",
     "pidm_actor": "PIDM pretrained, actor only",
     "pidm_critic": "PIDM pretrained, critic only",
+    "pidm_7k": "PIDM pretrained on 7 k",
+    "pidm_70k": "PIDM pretrained on 70 k",
+    "pidm_700k": "PIDM pretrained on 700 k",
     "pidm_scaled": "PIDM pretrained, scaled",
     "pidm_slow": "PIDM pretrained, slow start",
 }
-PAPER = {  # Table I: method -> task -> (final performance, iterations to 90 %), percent against PIDM random
-    "mlp": {"go1_loco": (0.6, 2.2), "anymal_loco": (0.5, -28.7), "g1_loco": (-0.2, -46.7)},
-    "pidm_pretrained": {"go1_loco": (3.6, -17.7), "anymal_loco": (10.1, -33.1), "g1_loco": (10.0, -34.0)},
+PAPER = {  # measure -> method -> percent against PIDM random by task, in the order of TASKS; Tables I and II
+    "final": {
+        "mlp": (0.5, 0.2, -0.8, -3.7, -0.3, 1.8, 11.1, 0.6, -0.2),
+        "pidm_pretrained": (10.1, 6.3, 0.7, 0.4, 0.0, 1.8, 5.9, 3.6, 10.0),
+        "pidm_actor": (None, None, None, 0.0, 0.0),
+        "pidm_critic": (None, None, None, 0.2, 0.0),
+    },
+    "to 90%": {
+        "mlp": (-28.7, 5.0, -18.7, 48.6, 35.3, -29.5, -53.0, 2.2, -46.7),
+        "pidm_pretrained": (-33.1, -42.0, -35.3, -15.9, -41.8, -57.3, -49.3, -17.7, -34.0),
+        "pidm_actor": (None, None, None, -10.9, -34.7),
+        "pidm_critic": (None, None, None, -1.1, -21.5),
+    },
 }
-COLUMNS = ("iteration", "seconds", "episode_return", "lr", "action_std")  # of metrics.csv
+DRAWS = 10_000  # bootstrap samples
 
 
 @dataclass(frozen=True)
 class Args:
-    check: bool = False  # compare with the README on disk instead of writing it
+    check: bool = False  # compare with the pages on disk instead of writing them
     beside: str | None = None  # a run folder: draw its curve with those of the study
 
 
+# --- Runs ---
+
+
+def left_out(folder, why):
+    """Say that a run is not counted, and why."""
+    print(f"warning: {folder.relative_to(ROOT)} left out: {why}", file=sys.stderr)
+
+
 def load_run(folder):
-    """One run: steps (R,), returns (R,), the evaluation and the settings; None, with a warning, if it is not whole."""
+    """One run: its columns, each (R,), its evaluation and settings; None, with a warning, if it is not whole."""
     try:
         record = json.loads((folder / "args.json").read_text())
         result = json.loads((folder / "eval.json").read_text())
         with (folder / "metrics.csv").open() as file:
             rows = list(csv.DictReader(file))
-        columns = {name: np.array([float(row[name]) for row in rows]) for name in COLUMNS}
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        print(f"warning: {folder.relative_to(ROOT)} left out: {error}", file=sys.stderr)
-        return None
-    steps = record["num_envs"] * record["num_steps"]
-    if columns["iteration"][-1] * steps < record["total_steps"]:
-        print(f"warning: {folder.relative_to(ROOT)} left out: stopped before its last step", file=sys.stderr)
-        return None
-    keys = ("num_envs", "num_steps", "total_steps", "lr", "num_epochs", "mirror_coef", "config")
-    return {
-        "iteration": columns["iteration"],
-        "return": columns["episode_return"],
-        "lr": columns["lr"],
-        "action_std": columns["action_std"],
-        "seconds": columns["seconds"][-1],
-        "errors": result["task"],
-        "settings": {key: record[key] for key in keys},
-        "seed": record["seed"],
-        "versions": record["versions"],
-    }
+        columns = {name: np.array([float(row[name]) for row in rows]) for name in rows[0]}
+        complete = columns["env_steps"][-1] >= record["total_steps"]
+        keys = ("num_envs", "num_steps", "total_steps", "lr", "num_epochs", "mirror_coef", "config")
+        run = {
+            "columns": columns,
+            "iteration": columns["iteration"],
+            "indicator": columns["progress" if "progress" in columns else "episode_return"],
+            "errors": result.get("task", {}),
+            "settings": {key: record[key] for key in keys},
+            "seed": record["seed"],
+            "versions": record["versions"],
+        }
+    except (OSError, ValueError, KeyError, TypeError, IndexError) as error:
+        return left_out(folder, error)
+    return run if complete else left_out(folder, "stopped before its last step")
 
 
 def load_task(folder):
@@ -87,93 +115,83 @@ def load_task(folder):
                 continue
             settings = settings or one["settings"]
             if one["settings"] != settings:
-                print(f"warning: {seed.relative_to(ROOT)} left out: other settings than the rest", file=sys.stderr)
+                left_out(seed, "other settings than the rest")
                 continue
             runs.setdefault(method, []).append(one)
     return runs
 
 
+# --- Measures ---
+
+
 def final(run):
-    """Mean return of the last 5% of rows."""
-    return run["return"][-max(len(run["return"]) // 20, 1) :].mean()
+    """Mean indicator of the last 5% of rows."""
+    return run["indicator"][-max(len(run["indicator"]) // 20, 1) :].mean()
 
 
 def area(run):
-    """Mean return over the whole training."""
-    return np.nanmean(run["return"])
+    """Mean indicator over the whole training."""
+    return np.nanmean(run["indicator"])
 
 
 def iterations_to(run, level):
-    """First iteration at which the return, averaged over 5 rows, is at least `level`; NaN if never."""
-    smooth = np.convolve(run["return"], np.ones(5) / 5, "valid")
+    """First iteration at which the indicator, averaged over 5 rows, is at least `level`; NaN if never."""
+    smooth = np.convolve(run["indicator"], np.ones(5) / 5, "valid")
     reached = np.flatnonzero(smooth >= level)
     return run["iteration"][reached[0] + 4] if len(reached) else np.nan
 
 
-def interval(values, baseline):
-    """Percent of mean(values) against mean(baseline), with a 95% bootstrap interval over the seeds of both."""
-    values, baseline = np.asarray(values), np.asarray(baseline)
-    rng = np.random.default_rng(0)
-    draws = [rng.choice(x, (10_000, len(x))).mean(1) for x in (values, baseline)]
-    spread = 100 * (draws[0] / draws[1] - 1)
-    middle = 100 * (values.mean() / baseline.mean() - 1)
-    if len(values) < 2:
-        return f"{middle:+.1f}"
-    return f"{middle:+.1f} [{np.quantile(spread, 0.025):+.1f}, {np.quantile(spread, 0.975):+.1f}]"
-
-
-def against_random(values, baseline, is_baseline):
-    """A cell: nothing for the baseline itself, `not reached` where a seed did not."""
-    missing = int(np.isnan(values).sum())
-    if missing:
-        return f"not reached by {missing} of {len(values)}"
-    return "0" if is_baseline else interval(values, baseline)
-
-
-def table(task, runs):
-    """Markdown lines of one task."""
-    baseline = runs.get("pidm_random")
-    if not baseline:
-        return ["PIDM random was not run, so there is nothing to compare with."]
-    goal = np.mean([final(run) for run in baseline])
-    measures = {
+def measures(runs):
+    """Name -> function of a run; levels are those of PIDM random's final performance."""
+    goal = np.mean([final(run) for run in runs["pidm_random"]])
+    return {
         "final": final,
         "to 90%": lambda run: iterations_to(run, 0.9 * goal),
         "to 50%": lambda run: iterations_to(run, 0.5 * goal),
         "area": area,
     }
-    rows = []
-    for method, title in METHODS.items():
-        if method not in runs:
-            continue
-        mine = runs[method]
-        values = {name: [measure(run) for run in mine] for name, measure in measures.items()}
-        percent = {
-            name: against_random(values[name], [measure(run) for run in baseline], method == "pidm_random")
-            for name, measure in measures.items()
-        }
-        mean = {name: np.mean([run["errors"][name] for run in mine]) for name in mine[0]["errors"]}
-        paper = PAPER.get(method, {}).get(task)
-        rows.append(
-            {
-                "method": title,
-                "seeds": ", ".join(str(run["seed"]) for run in mine),
-                "final return": f"{np.mean(values['final']):.2f} ± {np.std(values['final']):.2f}",
-                "% of random": percent["final"],
-                "paper": f"{paper[0]:+.1f}" if paper else "",
-                "iterations to 90%": cell_of_counts(values["to 90%"]),
-                "% of random ": percent["to 90%"],
-                "paper ": f"{paper[1]:+.1f}" if paper else "",
-                "iterations to 50%": cell_of_counts(values["to 50%"]),
-                "% of random  ": percent["to 50%"],
-                "area, % of random": percent["area"],
-                "mean action: return": f"{mean['episode_return']:.2f}",
-                "velocity error [m/s]": f"{mean['lin_vel_error']:.3f}",
-                "falls": f"{100 * mean['falls']:.0f}%",
-                "minutes": f"{np.mean([run['seconds'] for run in mine]) / 60:.1f}",
-            }
-        )
-    return markdown(rows)
+
+
+def percent(values, baseline):
+    """Percent of mean(values) against mean(baseline), and DRAWS of it with seeds of both drawn anew."""
+    values, baseline = np.asarray(values), np.asarray(baseline)
+    rng = np.random.default_rng(0)
+    draws = [rng.choice(x, (DRAWS, len(x))).mean(1) for x in (values, baseline)]
+    return 100 * (values.mean() / baseline.mean() - 1), 100 * (draws[0] / draws[1] - 1)
+
+
+def interval(middle, draws):
+    """A percentage with its 95% interval; without, where all draws are one."""
+    if np.ptp(draws) == 0:
+        return f"{middle:+.1f}"
+    return f"{middle:+.1f} [{np.quantile(draws, 0.025):+.1f}, {np.quantile(draws, 0.975):+.1f}]"
+
+
+def compare(runs, method, name):
+    """Percent of one measure against PIDM random with draws; or words, where there is none."""
+    if method not in runs or "pidm_random" not in runs:
+        return "not run"
+    measure = measures(runs)[name]
+    values, baseline = ([measure(run) for run in runs[m]] for m in (method, "pidm_random"))
+    missing = int(np.isnan(values).sum())
+    if missing or np.isnan(baseline).any():
+        return f"not reached by {missing} of {len(values)}"
+    return percent(values, baseline)
+
+
+def cell(runs, method, name):
+    """`compare` as text."""
+    found = compare(runs, method, name)
+    return found if isinstance(found, str) else interval(*found)
+
+
+def paper(method, name, task):
+    """The paper's percentage as text, empty where it has none."""
+    known = dict(zip(TASKS, PAPER[name].get(method, ()), strict=False)).get(task)
+    return "" if known is None else f"{known:+.1f}"
+
+
+# --- Tables ---
 
 
 def markdown(rows):
@@ -182,59 +200,191 @@ def markdown(rows):
     return ["| " + " | ".join(cell.strip() for cell in line) + " |" for line in lines]
 
 
-def noise_table(runs):
-    """Markdown lines: how the KL-controlled step size and the action std went, which the noisy return hangs on."""
+def seeds(runs, methods):
+    """How many seeds each of these methods has."""
+    counts = [len(runs.get(method, ())) for method in methods]
+    return str(counts[0]) if len(set(counts)) == 1 else " / ".join(map(str, counts))
+
+
+def table_1(study):
+    """Paper Table I: final performance and iterations to converge of MLP and pretrained PIDM, against PIDM random."""
+    methods = {"mlp": "MLP", "pidm_pretrained": "pretrained"}
+    names = {"final": "final", "to 90%": "iterations"}
+    columns = [(f"{title}: {label} [%]", m, n) for n, title in names.items() for m, label in methods.items()]
     rows = []
-    for method, mine in runs.items():
-        shrink = [np.log(run["action_std"][-1] / run["action_std"][0]) / run["lr"].sum() for run in mine]
-        rows.append(
-            {
-                "method": METHODS[method],
-                "mean step size": f"{np.mean([run['lr'].mean() for run in mine]):.3g}",
-                "final action std": f"{np.mean([run['action_std'][-1] for run in mine]):.3f}",
-                "change of log std over summed step sizes": f"{np.mean(shrink):.0f}",
-            }
-        )
+    for task, title in TASKS.items():
+        runs = study.get(task, {})
+        row = {"task": title, "seeds": seeds(runs, ("mlp", "pidm_random", "pidm_pretrained"))}
+        for i, (head, method, name) in enumerate(columns):
+            row |= {head: cell(runs, method, name), "paper" + " " * i: paper(method, name, task)}
+        rows.append(row)
+    row = {"task": "mean of the tasks that were run", "seeds": ""}
+    for i, (head, method, name) in enumerate(columns):
+        found = {task: compare(study.get(task, {}), method, name) for task in TASKS}
+        known = {task: value for task, value in found.items() if not isinstance(value, str)}
+        mean = interval(*(np.mean(x, axis=0) for x in zip(*known.values(), strict=True))) if known else "not run"
+        theirs = [dict(zip(TASKS, PAPER[name][method], strict=False))[task] for task in known]
+        row |= {head: mean, "paper" + " " * i: f"{np.mean(theirs):+.1f}" if known else ""}
+    return markdown([*rows, row])
+
+
+def ablation(study, methods, tasks):
+    """Final performance and iterations of `methods` (name -> title), a row each, for each task."""
+    rows = []
+    for method, title in methods.items():
+        row = {"method": title}
+        for i, task in enumerate(tasks):
+            runs = study.get(task, {})
+            for j, name in enumerate(("final", "to 90%")):
+                what = "final" if name == "final" else "iterations"
+                row[f"{TASKS[task]}: {what} [%]"] = cell(runs, method, name)
+                row["paper" + " " * (2 * i + j)] = paper(method, name, task)
+        rows.append(row)
     return markdown(rows)
 
 
-def cell_of_counts(counts):
+def details(runs):
+    """Lines about one task: every method in absolute figures, and how step size and noise went."""
+    functions = measures(runs) if "pidm_random" in runs else {"final": final, "area": area}
+    rows = []
+    for method, mine in runs.items():
+        values = {name: [function(run) for run in mine] for name, function in functions.items()}
+        last = {name: np.mean([run["columns"][name][-1] for run in mine]) for name in ("action_std", "seconds")}
+        shrink = [np.log(r["columns"]["action_std"][-1] / r["columns"]["action_std"][0]) for r in mine]
+        steps = [r["columns"]["lr"].sum() for r in mine]
+        row = {
+            "method": METHODS[method],
+            "seeds": ", ".join(str(run["seed"]) for run in mine),
+            "final": f"{np.mean(values['final']):.4g} ± {np.std(values['final']):.2g}",
+            "area [%]": "0" if method == "pidm_random" else cell(runs, method, "area"),
+            "iterations to 50%": counts(values.get("to 50%", [np.nan])),
+            "iterations to 90%": counts(values.get("to 90%", [np.nan])),
+        }
+        for name in sorted(mine[0]["errors"].keys() - {"diverged"}):
+            row[f"mean action: {name}"] = f"{np.mean([run['errors'][name] for run in mine]):.3g}"
+        row |= {
+            "mean step size": f"{np.mean([r['columns']['lr'].mean() for r in mine]):.3g}",
+            "final action std": f"{last['action_std']:.3f}",
+            "change of log std over summed step sizes": f"{np.mean(np.divide(shrink, steps)):.0f}",
+            "minutes": f"{last['seconds'] / 60:.1f}",
+        }
+        rows.append(row)
+    return markdown(rows)
+
+
+def counts(values):
     """Mean of iteration counts, NaN where a level was not reached."""
-    return "not reached" if np.isnan(counts).all() else f"{np.nanmean(counts):.0f}"
+    return "not reached" if np.isnan(values).all() else f"{np.nanmean(values):.0f}"
 
 
-def draw(tasks, path, extra=None):
-    """Mean and std of the return over iterations, a panel a task; `extra` (label, iteration, return) goes on top."""
+# --- Figures ---
+
+
+def panels(count, width=3):
+    """pyplot, a figure, and `count` axes in rows of at most `width`."""
     plt = records.pyplot()
-    fig, axes = plt.subplots(1, len(tasks), figsize=(5.5 * len(tasks), 3.6), constrained_layout=True, squeeze=False)
-    for ax, (task, runs) in zip(axes[0], tasks.items(), strict=True):
+    columns = min(count, width)
+    rows = -(-count // columns)
+    fig, axes = plt.subplots(rows, columns, figsize=(5 * columns, 3.4 * rows), constrained_layout=True, squeeze=False)
+    for ax in axes.ravel()[count:]:
+        ax.axis("off")
+    return plt, fig, axes.ravel()[:count]
+
+
+def save(plt, fig, path):
+    fig.savefig(path, dpi=100, metadata={"Software": None})
+    plt.close(fig)
+
+
+def draw_curves(study, path, extra=None):
+    """Mean and std of the indicator over iterations, a panel a task; `extra` (label, iteration, value) goes on top."""
+    plt, fig, axes = panels(len(study))
+    for ax, (task, runs) in zip(axes, study.items(), strict=True):
         for method, mine in runs.items():
-            curves = np.stack([run["return"] for run in mine])
-            iteration, mean, std = mine[0]["iteration"], curves.mean(0), curves.std(0)
+            values = np.stack([run["indicator"] for run in mine])
+            iteration, mean, std = mine[0]["iteration"], values.mean(0), values.std(0)
             (line,) = ax.plot(iteration, mean, label=f"{METHODS[method]} ({len(mine)})")
             ax.fill_between(iteration, mean - std, mean + std, alpha=0.15, color=line.get_color())
         if extra:
             ax.plot(*extra[1:], color="black", label=extra[0])
-        ax.set(title=task, xlabel="PPO iteration", ylabel="episode return")
+        parkour = "progress" in next(iter(runs.values()))[0]["columns"]
+        ax.set(title=TASKS[task], xlabel="PPO iteration", ylabel="progress" if parkour else "episode return")
         ax.grid(alpha=0.3)
         ax.legend(fontsize=8)
-    fig.savefig(path, dpi=110, metadata={"Software": None})
-    plt.close(fig)
+    save(plt, fig, path)
 
 
-def report(scale):
-    """Text of the report of one scale, and task -> runs."""
-    tasks = {folder.name: load_task(folder) for folder in sorted((STUDY / scale).iterdir()) if folder.is_dir()}
-    lines = []
-    for task, runs in tasks.items():
-        any_run = next(iter(runs.values()))[0]
-        s, v = any_run["settings"], any_run["versions"]
-        lines += [f"## {task}, scale {scale}", ""]
-        lines += [
-            f"{s['num_envs']} x {s['num_steps']}, {s['total_steps'] / 1e6:.1f} M steps, engine `c`, {v['machine']}."
-        ]
-        lines += ["", *table(task, runs), "", *noise_table(runs), ""]
-    return lines, tasks
+def draw_updates(study, path):
+    """Paper Fig. 6: mean change of a weight of the actor in an iteration, by submodule, random against pretrained."""
+    methods = {"pidm_random": "--", "pidm_pretrained": "-"}
+    known = {task: runs for task, runs in study.items() if all(m in runs for m in methods)}
+    if not known:
+        return False
+    plt, fig, axes = panels(len(known))
+    for ax, (task, runs) in zip(axes, known.items(), strict=True):
+        names = [name for name in runs["pidm_random"][0]["columns"] if name.startswith("update/actor/")]
+        for i, name in enumerate(names):
+            for method, style in methods.items():
+                mean = np.mean([run["columns"][name] for run in runs[method]], axis=0)
+                label = f"{name.removeprefix('update/actor/')}, {METHODS[method].removeprefix('PIDM ')}"
+                ax.semilogy(runs[method][0]["iteration"], mean, style, color=f"C{i}", label=label, linewidth=1)
+        ax.set(title=TASKS[task], xlabel="PPO iteration", ylabel="mean change of a weight")
+        ax.grid(alpha=0.3)
+        ax.legend(fontsize=6)
+    save(plt, fig, path)
+    return True
+
+
+# --- Pages ---
+
+HEAD = """# Results
+
+Written by `python results/report.py` from the runs in [study](study); `--check` compares. Percentages are against PIDM
+random. Final performance is the mean indicator of the last 5% of a training (episode return of the noisy policy;
+parkour: progress of the curriculum), iterations those to 90% of PIDM random's final performance; less is better.
+Brackets are 95% bootstrap intervals over seeds; with few seeds they are rough, and with one there are none.
+"""
+BEYOND = """`PIDM shuffled` has the pretrained weights permuted within each layer: the same scale, no knowledge.
+`scaled` halves the loaded backbone's output; `slow start` lets loaded parts move little in the first 50 iterations.
+"""
+BEGIN, END = "<!-- results/report.py writes from here -->", "<!-- to here -->"
+
+
+def load_study(scale):
+    """Task -> runs, in the paper's order, of what was run."""
+    loaded = {task: load_task(STUDY / scale / task) for task in TASKS}
+    return {task: runs for task, runs in loaded.items() if runs}
+
+
+def page(study, updates):
+    """Text of results/README.md."""
+    lines = [HEAD, "## Table I", "", *table_1(study), "", "![curves](study/curves.png)", ""]
+    climbing = ("anymal_climb_up", "anymal_climb_down")
+    parts = {m: METHODS[m] for m in ("pidm_actor", "pidm_critic", "pidm_pretrained")}
+    lines += ["## Table II: which network is pretrained", "", *ablation(study, parts, climbing), ""]
+    sizes = {m: METHODS[m] for m in ("pidm_7k", "pidm_70k", "pidm_700k", "pidm_pretrained")}
+    lines += ["## Size of the pretraining set", "", *ablation(study, sizes, climbing), ""]
+    ran = set().union(*study.values())
+    beyond = {m: METHODS[m] for m in ("pidm_shuffled", "pidm_scaled", "pidm_slow") if m in ran}
+    if beyond:
+        tasks = [task for task, runs in study.items() if beyond.keys() & runs.keys()]
+        lines += ["## Controls, and what the paper does not have", ""]
+        lines += [BEYOND, *ablation(study, beyond, tasks), ""]
+    if updates:
+        lines += ["## Which weights move", "", "![updates](study/updates.png)", ""]
+    lines += ["## Data and accuracy of the PIDM", "", "See [pidm](pidm/README.md).", "", "## Each task", ""]
+    for task, runs in study.items():
+        one = next(iter(runs.values()))[0]
+        s, v = one["settings"], one["versions"]
+        size = f"{s['num_envs']} x {s['num_steps']}, {s['total_steps'] / 1e6:.1f} M steps"
+        lines += [f"### {TASKS[task]}", "", f"`{task}`, {size}, {v['device']}, {v['machine']}.", "", *details(runs), ""]
+    return "\n".join(lines).rstrip() + "\n"
+
+
+def with_table(text, study):
+    """The project's README with Table I between the marks."""
+    before, rest = text.split(BEGIN)
+    return "\n".join([before + BEGIN, "", *table_1(study), "", END + rest.split(END)[1]])
 
 
 def beside(folder):
@@ -242,47 +392,42 @@ def beside(folder):
     try:
         task = json.loads((folder / "args.json").read_text())["task"]
         with (folder / "metrics.csv").open() as file:
-            rows = [(float(row["iteration"]), float(row["episode_return"])) for row in csv.DictReader(file)]
-    except (OSError, ValueError, KeyError) as error:
+            rows = list(csv.DictReader(file))
+        name = "progress" if "progress" in rows[0] else "episode_return"
+        points = [(float(row["iteration"]), float(row[name])) for row in rows]
+    except (OSError, ValueError, KeyError, IndexError) as error:
         raise records.UserError(f"{folder} is not a run of ppo_finetune.py: {error}") from None
-    if not (STUDY / "cpu" / task).is_dir():
+    runs = load_task(STUDY / "cpu" / task)
+    if not runs:
         raise records.UserError(f"results/study has no runs of {task}")
     path = folder / "beside_recorded.png"
-    draw({task: load_task(STUDY / "cpu" / task)}, path, ("this run", *zip(*rows, strict=True)))
+    draw_curves({task: runs}, path, ("this run", *zip(*points, strict=True)))
     print(f"wrote {path}")
 
 
-HEAD = """# Study
-
-Written by `python results/report.py` from the runs beside it; `--check` compares. Final return and area are the noisy
-policy's in training; then follow return, velocity error and falls of its mean action, over 64 episodes of 20 s.
-Percentages are against PIDM random, with 95% bootstrap intervals over seeds (with so few seeds they are rough).
-`PIDM shuffled` has the pretrained weights permuted within each layer: the same scale, no knowledge. Minutes are of
-machines that may have run two trainings at once.
-
-![curves](curves.png)
-"""
-
-
 def main(args):
-    """Write the report, or with --check exit 1 where it differs from the one on disk."""
+    """Write the pages and figures, or with --check exit 1 where a page differs from the one on disk."""
     if args.beside:
         return beside(Path(args.beside))
-    lines, tasks = report("cpu")
-    text = "\n".join([HEAD, *lines]).rstrip() + "\n"
+    study = load_study("cpu")
+    if not study:
+        raise records.UserError("results/study has no finished runs; run results/study.py")
+    updates = any("pidm_pretrained" in runs and "pidm_random" in runs for runs in study.values())
+    readme = (ROOT / "README.md").read_text()
+    pages = {ROOT / "results/README.md": page(study, updates), ROOT / "README.md": with_table(readme, study)}
     if args.check:
-        if (STUDY / "README.md").read_text() != text:
-            sys.exit("results/study/README.md is not what the runs give; run results/report.py")
+        for path, text in pages.items():
+            if not path.exists() or path.read_text() != text:
+                sys.exit(f"{path.relative_to(ROOT)} is not what the runs give; run results/report.py")
         return None
-    records.replace_text(STUDY / "README.md", text)
-    draw(tasks, STUDY / "curves.png")
-    print(text)
+    for path, text in pages.items():
+        records.replace_text(path, text)
+    draw_curves(study, STUDY / "curves.png")
+    draw_updates(study, STUDY / "updates.png")
+    print(pages[ROOT / "results/README.md"])
     return None
 
 
 if __name__ == "__main__":
-    try:
+    with records.one_line_errors():
         main(tyro.cli(Args, description=__doc__))
-    except records.UserError as error:
-        print(f"error: {error}", file=sys.stderr)
-        sys.exit(2)

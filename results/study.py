@@ -1,33 +1,35 @@
-"""Run the comparison: tasks x methods x seeds of ppo_finetune.py, what is missing only.
+"""The paper's comparison: tasks x methods x seeds of ppo_finetune.py. Runs what is missing, goes on with what broke.
 
-    python results/study.py --tasks go1_loco --seeds 0 1 2 --total-steps 5000000
-    python results/study.py --tasks anymal_loco --jobs 2
-    python results/study.py --list
+    python results/study.py --status
+    python results/study.py --tasks go1_loco --seeds 0 1 2 --budget-minutes 120
+    python results/study.py --list | parallel -j 8
 
-A run is trained and evaluated in runs/study/<scale>/<task>/<method>/seed<k>; its small files are kept under
-results/study in the same folders, where report.py reads them.
+Without --tasks, --methods and --seeds it is the whole grid: Table I of the paper (nine tasks, three methods, five
+seeds), Table II (actor or critic alone), the sizes of the pretraining set, and a control with shuffled weights. A run
+is trained and evaluated in runs/study/<scale>/<task>/<method>/seed<k>; its small files are kept under results/study in
+the same folders, where report.py reads them. Scales never mix.
 """
 
 import csv
-import itertools
 import json
-import shlex
+import signal
 import sys
 import time
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import tyro
 
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 
-import recording
-
 import envs
+from envs import records
+from results import recording
 
 PIDM = "assets/pidm/{robot}.msgpack"
+SMALL = "results/pidm/{robot}/sizes/{size}.msgpack"  # made by pidm.py --stages sizes
 METHODS = {  # method -> arguments of ppo_finetune.py
     "mlp": ("--network", "mlp"),
     "pidm_random": ("--network", "pidm"),
@@ -35,77 +37,127 @@ METHODS = {  # method -> arguments of ppo_finetune.py
     "pidm_shuffled": ("--pretrained", PIDM, "--init", "shuffled"),
     "pidm_actor": ("--pretrained", PIDM, "--init", "actor"),
     "pidm_critic": ("--pretrained", PIDM, "--init", "critic"),
+    "pidm_7k": ("--pretrained", SMALL.replace("{size}", "7000")),
+    "pidm_70k": ("--pretrained", SMALL.replace("{size}", "70000")),
+    "pidm_700k": ("--pretrained", SMALL.replace("{size}", "700000")),
     # beyond the paper
     "pidm_scaled": ("--pretrained", PIDM, "--core-scale", "0.5"),  # features as large as fresh ones
     "pidm_slow": ("--pretrained", PIDM, "--warm-iterations", "50"),
 }
+TABLE_1 = ("mlp", "pidm_random", "pidm_pretrained")
+ABLATIONS = ("pidm_actor", "pidm_critic", "pidm_7k", "pidm_70k", "pidm_700k")
+GRID = {  # task -> methods; blind tasks first
+    **dict.fromkeys(("go1_loco", "anymal_loco", "anymal_pedipulation", "g1_loco"), (*TABLE_1, "pidm_shuffled")),
+    **dict.fromkeys(("anymal_climb_up", "anymal_climb_down"), (*TABLE_1, *ABLATIONS)),
+    **dict.fromkeys(("anymal_crouch", "anymal_jump", "anymal_parkour_walk"), TABLE_1),
+}
+STEPS = {"cpu": {"go1_loco": 8_000_000}}  # where PIDM random needs more than the preset's to converge
 KEPT = ("args.json", "metrics.csv", "eval.json")
 
 
 @dataclass(frozen=True)
 class Args:
-    tasks: tuple[str, ...] = ("go1_loco",)
-    methods: tuple[str, ...] = ("mlp", "pidm_random", "pidm_pretrained", "pidm_shuffled")
-    seeds: tuple[int, ...] = (0, 1, 2)
-    scale: str = "cpu"  # preset
-    total_steps: int | None = None  # None: the preset's
-    jobs: int = 1  # runs at once, on the same machine: together a little faster, each slower
-    budget_minutes: float = 1e9  # start no run after this
-    list: bool = False  # print the training commands and stop
+    tasks: tuple[str, ...] = tuple(GRID)
+    methods: tuple[str, ...] | None = None  # None: the task's in the grid
+    seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
+    scale: Literal["smoke", "cpu", "gpu"] = "cpu"  # preset
+    budget_minutes: float = 1e9  # then stop; the same command goes on
+    list: bool = False  # print the commands of what is missing, one a line, and stop
+    status: bool = False  # print what is there, and stop
 
 
-def command(args, task, method, folder, seed):
-    """The arguments of ppo_finetune.py for one run."""
-    robot = envs.TASKS[task][1].robot
-    words = ["--task", task, "--preset", args.scale, "--seed", str(seed)]
-    words += [word.format(robot=robot) for word in METHODS[method]]
-    words += ["--total-steps", str(args.total_steps)] if args.total_steps else []
-    return [*words, "--run-dir", f"runs/{folder}", "--force"]
+@dataclass(frozen=True)
+class Cell:
+    """One run of the study."""
+
+    scale: str
+    task: str
+    method: str
+    seed: int
+
+    @property
+    def folder(self):
+        """Below runs/ and below results/."""
+        return f"study/{self.scale}/{self.task}/{self.method}/seed{self.seed}"
+
+    def words(self):
+        """Arguments of ppo_finetune.py: for a new run, or for one that broke."""
+        run = ROOT / "runs" / self.folder
+        if (run / records.STATE).exists():
+            return ["--resume", f"runs/{self.folder}"]
+        robot = envs.TASKS[self.task][1].robot
+        words = ["--task", self.task, "--preset", self.scale, "--seed", str(self.seed)]
+        words += [word.format(robot=robot) for word in METHODS[self.method]]
+        steps = STEPS.get(self.scale, {}).get(self.task)
+        words += ["--total-steps", str(steps)] if steps else []
+        return [*words, "--run-dir", f"runs/{self.folder}", "--force"]
+
+    def done(self):
+        """Share of its steps that a run has made, 1 if it is kept. None if it never started."""
+        if all((ROOT / "results" / self.folder / name).exists() for name in KEPT):
+            return 1.0
+        run = ROOT / "runs" / self.folder
+        try:
+            with (run / "metrics.csv").open() as file:
+                rows = list(csv.DictReader(file))
+            return min(float(rows[-1]["env_steps"]) / json.loads((run / "args.json").read_text())["total_steps"], 0.99)
+        except (OSError, ValueError, KeyError, IndexError):
+            return None
 
 
-def finished(folder):
-    """Whether the kept copy of a run reached its steps and was evaluated."""
-    kept = ROOT / "results" / folder
-    if not all((kept / name).exists() for name in KEPT):
-        return False
-    wanted = json.loads((kept / "args.json").read_text())["total_steps"]
-    with (kept / "metrics.csv").open() as file:
-        rows = list(csv.DictReader(file))
-    return float(rows[-1]["env_steps"]) >= wanted
+def cells(args):
+    """Runs in order: one seed of every method before the next seed, so that a stopped study can be compared."""
+    for task in args.tasks:
+        for seed in args.seeds:
+            for method in args.methods or GRID[task]:
+                yield Cell(args.scale, task, method, seed)
 
 
-def run(task, words, folder):
-    """Train, evaluate and keep the small files."""
-    log = ROOT / "runs" / folder / "log.txt"
+def show_status(every):
+    """A line for each task and method: `x` a finished seed, a percentage one that broke, `.` one that never started."""
+    found = {}
+    for cell in every:
+        done = cell.done()
+        mark = "." if done is None else "x" if done == 1.0 else f"{100 * done:.0f}%"
+        found.setdefault((cell.task, cell.method), []).append(mark)
+    for (task, method), marks in found.items():
+        print(f"{task:20}{method:17}{' '.join(marks)}")
+    count = sum(marks.count("x") for marks in found.values())
+    print(f"{count} of {sum(map(len, found.values()))} runs")
+
+
+def run(cell, seconds):
+    """Train for at most so long, then evaluate and keep the small files. Returns whether it came to its end."""
+    log = ROOT / "runs" / cell.folder / "log.txt"
     log.parent.mkdir(parents=True, exist_ok=True)
-    with log.open("w") as file:
-        recording.finetune(words, file)
-        recording.evaluate(task, folder, ROOT / "results" / folder, KEPT, file)
+    with log.open("a") as file:
+        if not recording.finetune(cell.words(), file, seconds):
+            return False
+        recording.evaluate(cell.task, cell.folder, ROOT / "results" / cell.folder, KEPT, file)
+    return True
 
 
 def main(args):
-    """All seeds of a method come after one seed of every method, so that a stopped study can be compared."""
-    for name in {*args.tasks} - envs.TASKS.keys() | {*args.methods} - METHODS.keys():
-        print(f"error: unknown task or method {name!r}; known: {', '.join([*envs.TASKS, *METHODS])}", file=sys.stderr)
-        sys.exit(2)
+    for name in {*args.tasks} - GRID.keys() | {*(args.methods or ())} - METHODS.keys():
+        raise records.UserError(f"unknown task or method {name!r}; known: {', '.join([*GRID, *METHODS])}")
+    every = list(cells(args))
+    if args.status:
+        return show_status(every)
+    missing = [cell for cell in every if cell.done() != 1.0]
     start = time.perf_counter()
-
-    def one(task, seed, method):
-        folder = f"study/{args.scale}/{task}/{method}/seed{seed}"
-        words = command(args, task, method, folder, seed)
+    for cell in missing:
+        left = 60 * args.budget_minutes - (time.perf_counter() - start)
         if args.list:
-            print(shlex.join(["python", "ppo_finetune.py", *words]))
-        elif finished(folder):
-            print(f"done     {folder}", flush=True)
-        elif time.perf_counter() - start > 60 * args.budget_minutes:
-            print(f"no time  {folder}", flush=True)
+            words = f"--tasks {cell.task} --methods {cell.method} --seeds {cell.seed} --scale {cell.scale}"
+            print(f"python results/study.py {words}")
+        elif left <= 0 or not run(cell, left):
+            return print("out of time; the same command goes on")
         else:
-            run(task, words, folder)
-            print(f"ran      {folder}  {(time.perf_counter() - start) / 60:.1f} min", flush=True)
-
-    with ThreadPoolExecutor(args.jobs) as pool:
-        list(pool.map(lambda cell: one(*cell), itertools.product(args.tasks, args.seeds, args.methods)))
+            print(f"ran {cell.folder}  {(time.perf_counter() - start) / 60:.1f} min", flush=True)
+    return None
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args, description=__doc__))
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that the run under way is asked to stop as well
+    with records.one_line_errors():
+        main(tyro.cli(Args, description=__doc__))

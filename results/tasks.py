@@ -20,10 +20,9 @@ import tyro
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 
-import recording
-
 import envs
 from envs import records
+from results import recording
 
 KEPT = ("args.json", "metrics.csv", "curve.png", "eval.json", "policy.msgpack", "rollout.png", "rollout.gif")
 

@@ -113,17 +113,6 @@ def test_pidm_table_is_what_was_recorded():
         assert row == f"| {robot} | " + " | ".join(figures) + " |"
 
 
-def test_study_table_is_what_was_recorded():
-    """Every cell of the README's rows stands in the same row of the study's page."""
-    page = (ROOT / "results/study/README.md").read_text().splitlines()
-    section = README.split("## Does it help?")[1].split("\n## ")[0]
-    rows = [line.strip("| ").split(" | ") for line in section.splitlines() if line.startswith(("| MLP", "| PIDM"))]
-    assert len(rows) == 4
-    for row in rows:
-        known = next(line.strip("| ").split(" | ") for line in page if line.startswith(f"| {row[0]} | "))
-        assert set(row) <= set(known), row
-
-
 def test_speed_tables_are_what_was_measured():
     section = README.split("## Speed")[1].split("\n## ")[0]
     rows = [line for line in section.splitlines() if line.startswith("|")]

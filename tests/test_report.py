@@ -9,7 +9,7 @@ from results import report
 
 
 def curve(values):
-    return {"iteration": np.arange(1.0, len(values) + 1), "return": np.asarray(values, float)}
+    return {"iteration": np.arange(1.0, len(values) + 1), "indicator": np.asarray(values, float)}
 
 
 def test_final_is_the_mean_of_the_last_twentieth():
@@ -25,17 +25,40 @@ def test_iterations_to_a_level():
 
 
 def test_interval_by_hand():
-    assert report.interval([11.0, 11.0], [10.0, 10.0]) == "+10.0 [+10.0, +10.0]"
-    assert report.interval([5.0], [10.0]) == "-50.0"
-    low, high = report.interval([8.0, 12.0], [10.0, 10.0]).split("[")[1].rstrip("]").split(", ")
+    assert report.interval(*report.percent([11.0, 11.0], [10.0, 10.0])) == "+10.0"
+    assert report.interval(*report.percent([5.0], [10.0])) == "-50.0"
+    low, high = report.interval(*report.percent([8.0, 12.0], [10.0, 10.0])).split("[")[1].rstrip("]").split(", ")
     assert (float(low), float(high)) == (-20.0, 20.0)
 
 
-def test_unreached_levels_are_said():
-    assert report.against_random([np.nan, 3.0], [2.0, 2.0], False) == "not reached by 1 of 2"
+def test_what_was_not_run_or_not_reached_is_said():
+    runs = {"pidm_random": [curve([10.0] * 10)], "mlp": [curve([10.0] * 10), curve([1.0] * 10)]}
+    assert report.cell(runs, "mlp", "to 90%") == "not reached by 1 of 2"
+    assert report.cell(runs, "mlp", "final").startswith("-45.0 [-90.0, ")
+    assert report.cell(runs, "pidm_pretrained", "final") == "not run"
+    assert report.cell({}, "mlp", "final") == "not run"
 
 
-def test_the_page_of_the_study_is_what_its_runs_give():
+def test_mean_over_tasks_is_of_those_that_were_run():
+    """Two tasks at +10 and -30 percent; the third lacks its baseline."""
+    ten = curve([10.0] * 10)
+    study = {
+        "go1_loco": {"pidm_random": [ten], "mlp": [curve([11.0] * 10)]},
+        "g1_loco": {"pidm_random": [ten], "mlp": [curve([7.0] * 10)]},
+        "anymal_loco": {"mlp": [ten]},
+    }
+    line = report.table_1(study)[-1].split(" | ")
+    assert line[2:4] == ["-10.0", "+0.2"] and line[4:6] == ["not run", ""]
+
+
+def test_the_paper_s_means_are_those_it_prints():
+    assert np.isclose(np.mean(report.PAPER["final"]["mlp"]), 1.0, atol=0.05)
+    assert np.isclose(np.mean(report.PAPER["final"]["pidm_pretrained"]), 4.3, atol=0.05)
+    assert np.isclose(np.mean(report.PAPER["to 90%"]["mlp"]), -9.5, atol=0.05)
+    assert np.isclose(np.mean(report.PAPER["to 90%"]["pidm_pretrained"]), -36.2, atol=0.1)
+
+
+def test_pages_are_what_the_runs_give():
     report.main(report.Args(check=True))
 
 
