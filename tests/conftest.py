@@ -6,7 +6,10 @@ import sys
 from pathlib import Path
 
 # Nearly all of the time of the tests is compilation: let the compiler try less hard, in the scripts they start as well.
-os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=1 --xla_llvm_disable_expensive_passes=true")
+FAST_COMPILER = (
+    "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true --xla_cpu_use_fusion_emitters=false"
+)
+os.environ.setdefault("XLA_FLAGS", FAST_COMPILER)
 
 import jax
 import jax.numpy as jnp

@@ -12,9 +12,10 @@ pytest.importorskip("warp")
 
 
 def drive(engine, task, steps, **options):
-    """qpos, torque, sensors and overflow of two robots, (steps, 2, ...), moved by the same random targets."""
+    """Physics of two robots, (steps, 2, ...), 1 mm in the ground at first and moved by the same random targets."""
     env = envs.make(task, engine, spawn_velocity=0.0, **options)
     physics = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), 2)).physics
+    physics = physics.replace(qpos=physics.qpos.at[:, 2].add(-0.001))
     targets = env.default_pose + 0.05 * jax.random.normal(jax.random.key(1), (steps, 2, env.action_dim))
     step = jax.vmap(env.engine.step)
     return jax.device_get(jax.jit(lambda p, t: jax.lax.scan(lambda p, t: (step(p, t),) * 2, p, t)[1])(physics, targets))
