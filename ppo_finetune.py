@@ -22,6 +22,7 @@ import flax
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 import tyro
 
@@ -54,6 +55,7 @@ class Args:
     eval: str | None = None  # a policy.msgpack: run it instead of training, write pictures beside it
     eval_envs: int = 64  # episodes of the evaluation, of each level where a task has levels
     level: int | None = None  # level of the evaluation and its pictures; None: all levels, pictures of level 4
+    export: str | None = None  # with --eval: write that policy as an ONNX file here instead; see `export_onnx`
     # --- Environment ---
     num_envs: int | None = None  # N
     num_steps: int | None = None  # T, per iteration and environment
@@ -661,21 +663,27 @@ def evaluate(env, net, params, num_envs, level=None):
     return result, jax.tree.map(lambda x: x[0], env_state.physics), qpos
 
 
-def run_eval(args):
-    """--eval: print the task's metrics of a saved policy, on its own commands and in the showcase; write pictures."""
-    from envs import render  # matplotlib and OpenGL are slow to load and not needed for training
-
+def load_policy(args, env):
+    """The network and parameters of the policy file args.eval; UserError if it is not one for this task."""
     path = Path(args.eval)
     params, meta = records.load(path, "policy")
     if meta["task"] != args.task:
         raise records.UserError(
             f"{path} is a policy for {meta['task']}, not for {args.task}; pass --task {meta['task']}"
         )
-    env, show = make_env(args), make_env(args, **showcase(args))
     trained = {name: meta["args"].get(name) for name in ("network", "init_std", "hidden", "intention")}
     net = make_net(dataclasses.replace(args, **trained), env)
     like = jax.eval_shape(net.init, jax.random.key(0), zero_inputs(env, net))
     records.check_shapes(path, params, like)
+    return net, params
+
+
+def run_eval(args):
+    """--eval: print the task's metrics of a saved policy, on its own commands and in the showcase; write pictures."""
+    from envs import render  # matplotlib and OpenGL are slow to load and not needed for training
+
+    env, show, path = make_env(args), make_env(args, **showcase(args)), Path(args.eval)
+    net, params = load_policy(args, env)
     report = {}
     run = jax.jit(lambda params, level: evaluate(env, net, params, args.eval_envs, level)[0])
     for level in levels(args, env):
@@ -703,6 +711,70 @@ def showcase(args):
     """Config fields of the pictured episode."""
     fields = envs.TASKS[args.task][0].SHOWCASE
     return fields | {"level": args.level} if "level" in fields and args.level is not None else fields
+
+
+# --- Deployment ---
+
+
+def onboard(env, net, params):
+    """What a robot computes every control step, as a function of arrays without a leading axis, and their widths.
+
+    In: the observation's blocks in SI units (joint_pos [rad] is absolute; no `action`), prop_history (K, X) and
+    action_history (K, A), oldest first. Out: action (A,), joint_target (A,) [rad] for the PD loops, and both
+    histories for the next step. An episode starts with K copies of its first x_t and with actions of 0.
+    """
+    dummy = jax.eval_shape(env.reset, jax.random.key(0))
+    shapes = {name: (env.width(kind),) for name, (kind, _) in env.OBS.items() if name != "action"}
+    shapes |= {"prop_history": (env.config.history, env.prop_dim), "action_history": dummy.history["action"].shape}
+
+    def policy(*arrays):
+        given = dict(zip(shapes, arrays, strict=True))
+        past = given["action_history"]
+        given |= {"joint_pos": given["joint_pos"] - env.default_pose, "action": past[-1]}
+        prop = jnp.concatenate([given[name] for name in env.prop_layout])
+        history = {"prop": jnp.concatenate([given["prop_history"], prop[None]]), "action": past}
+        inputs = net_inputs(net, env.pack(given), history)
+        action = net.apply(params, jax.tree.map(lambda x: x[None], inputs), method=net.mean)[0]
+        target = env.default_pose + env.robot.action_scale * action
+        return action, target, history["prop"][1:], jnp.concatenate([past, action[None]])[1:]
+
+    return policy, shapes
+
+
+def export_onnx(args):
+    """--eval POLICY --export FILE: write the policy's mean action as an ONNX graph for one robot, batch 1.
+
+    Inputs and outputs are those of `onboard`. Metadata: task, robot, joints, default_pose, action_scale, dt, history,
+    and versions, each as JSON. Needs requirements-export.txt.
+    """
+    try:
+        import jax2onnx
+        import onnx
+    except ImportError:
+        raise records.UserError("--export needs jax2onnx: pip install -r requirements-export.txt") from None
+    env = make_env(args)
+    policy, shapes = onboard(env, *load_policy(args, env))
+    inputs = [jax.ShapeDtypeStruct((1, *shape), jnp.float32) for shape in shapes.values()]
+    outputs = ["action", "joint_target", "next_prop_history", "next_action_history"]
+
+    def batch_of_one(*arrays):  # jax2onnx 0.17 cannot export a vmapped flax layer
+        return [x[None] for x in policy(*(x[0] for x in arrays))]
+
+    model = jax2onnx.to_onnx(batch_of_one, inputs, input_names=[*shapes], output_names=outputs)
+    facts = {
+        "task": args.task,
+        "robot": env.robot.name,
+        "joints": list(env.robot.joints),
+        "default_pose": np.asarray(env.default_pose).tolist(),
+        "action_scale": env.robot.action_scale,
+        "dt": env.dt,
+        "history": env.config.history,
+        "prop": list(env.prop_layout),
+        "versions": records.versions(),
+    }
+    onnx.helper.set_model_props(model, {name: json.dumps(value) for name, value in facts.items()})
+    records.replace_bytes(Path(args.export), model.SerializeToString())
+    print(f"wrote {args.export}")
 
 
 # --- Records ---
@@ -803,6 +875,10 @@ def main(args):
     with records.one_line_errors():
         devices.join(args.distributed)
         args = records.resumed(args) if args.resume else args
+        if args.export and not args.eval:
+            raise records.UserError("--export writes a trained policy; say which with --eval POLICY")
+        if args.export:
+            return export_onnx(args)
         return run_eval(args) if args.eval else train(args)
 
 

@@ -438,8 +438,11 @@ class Env:
         return sensed, jnp.concatenate([sensed[name] for name in PROP])
 
     def observe(self, sensed, task, action, motion, clock):
-        """Observation (O,): noisy readings, task inputs and last action, each times its fixed scale."""
-        blocks = sensed | self.task_inputs(task, motion, clock) | {"action": action}
+        """Observation (O,): noisy readings, task inputs and last action."""
+        return self.pack(sensed | self.task_inputs(task, motion, clock) | {"action": action})
+
+    def pack(self, blocks):
+        """Observation (O,) from its blocks by name, in SI units, each times its fixed scale."""
         return jnp.concatenate(
             [jnp.atleast_1d(blocks[name] * jnp.array(scale)) for name, (_, scale) in self.OBS.items()]
         )

@@ -1,0 +1,162 @@
+"""Drive a robot in plain MuJoCo with an exported policy: no JAX, as on the robot's own computer.
+
+    python ppo_finetune.py --task go1_loco --eval results/tasks/go1_loco/policy.msgpack --export go1.onnx
+    python results/play_onnx.py go1.onnx --command 0.8 0 0 --seconds 10
+    python results/play_onnx.py go1.onnx --viewer
+
+With --viewer a window opens in which the arrow keys change the forward velocity and the turning rate, comma and full
+stop the sideways velocity, and the space bar stops. Needs requirements-export.txt; works for the locomotion tasks.
+"""
+
+import json
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import tyro
+
+ROOT = Path(__file__).resolve().parent.parent
+LIMIT = (1.0, 1.0, 1.0)  # of the command: m/s, m/s, rad/s
+KEYS = {  # GLFW key codes -> change of the command
+    265: (0.1, 0, 0),  # up
+    264: (-0.1, 0, 0),  # down
+    ord(","): (0, 0.1, 0),
+    ord("."): (0, -0.1, 0),
+    263: (0, 0, 0.1),  # left
+    262: (0, 0, -0.1),  # right
+}
+
+
+@dataclass(frozen=True)
+class Args:
+    policy: tyro.conf.Positional[str]  # an ONNX file of ppo_finetune.py --export
+    command: tuple[float, float, float] = (0.5, 0.0, 0.0)  # forward, sideways [m/s], turning [rad/s]
+    seconds: float = 20.0
+    viewer: bool = False  # watch and steer in a window
+
+
+class Player:
+    """One robot on a plane, its policy, and the history the policy wants back."""
+
+    def __init__(self, path):
+        import onnxruntime
+
+        self.session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
+        facts = self.session.get_modelmeta().custom_metadata_map
+        self.facts = {name: json.loads(value) for name, value in facts.items()}
+        self.pose = np.array(self.facts["default_pose"])
+        self.shapes = {given.name: given.shape for given in self.session.get_inputs()}
+        spec = mujoco.MjSpec.from_file(str(ROOT / f"assets/{self.facts['robot']}.xml"))
+        spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 0.1], contype=0, conaffinity=1)
+        spec.worldbody.add_light(pos=[0, 0, 3])
+        self.model = spec.compile()
+        self.data = mujoco.MjData(self.model)
+        self.decimation = round(self.facts["dt"] / self.model.opt.timestep)
+        self.history = None
+        self.stand()
+
+    def stand(self):
+        """The default pose, feet on the ground."""
+        m, d = self.model, self.data
+        mujoco.mj_resetData(m, d)
+        d.qpos[:7], d.qpos[7:] = (0, 0, 1, 1, 0, 0, 0), self.pose
+        mujoco.mj_kinematics(m, d)
+        solid = [i for i in range(m.ngeom) if m.geom_contype[i] and m.geom_type[i] == mujoco.mjtGeom.mjGEOM_SPHERE]
+        d.qpos[2] -= min(d.geom_xpos[i, 2] - m.geom_size[i, 0] for i in solid)
+        mujoco.mj_forward(m, d)
+        self.history = None
+
+    def readings(self, command):
+        """What the policy reads, in SI units and the base frame."""
+        d, turn = self.data, np.zeros(9)
+        mujoco.mju_quat2Mat(turn, d.qpos[3:7])
+        down = turn.reshape(3, 3).T
+        return {
+            "lin_vel": down @ d.qvel[:3],
+            "ang_vel": d.qvel[3:6],
+            "gravity": down @ [0, 0, -1],
+            "command": np.asarray(command),
+            "joint_pos": d.qpos[7:],
+            "joint_vel": d.qvel[6:],
+        }
+
+    def step(self, command):
+        """One control step; returns the action (A,)."""
+        read = self.readings(command)
+        if self.history is None:
+            x = np.concatenate([(read | {"joint_pos": read["joint_pos"] - self.pose})[n] for n in self.facts["prop"]])
+            past = np.zeros(self.shapes["action_history"][1:])
+            self.history = {"prop_history": np.tile(x, (self.facts["history"], 1)), "action_history": past}
+        values = read | self.history
+        feed = {name: np.float32(values[name])[None] for name in self.shapes}
+        action, target, prop, past = (out[0] for out in self.session.run(None, feed))
+        self.history = {"prop_history": prop, "action_history": past}
+        self.data.ctrl[:] = target
+        for _ in range(self.decimation):
+            mujoco.mj_step(self.model, self.data)
+        return action
+
+    def fallen(self):
+        return self.readings((0, 0, 0))["gravity"][2] > -0.5
+
+
+def watch(player, command):
+    """A window, until it is closed."""
+    import mujoco.viewer
+
+    wanted = np.array(command, float)
+
+    def press(key):
+        wanted[:] = 0.0 if key == ord(" ") else np.clip(wanted + KEYS.get(key, 0.0), np.negative(LIMIT), LIMIT)
+
+    with mujoco.viewer.launch_passive(player.model, player.data, key_callback=press) as window:
+        while window.is_running():
+            start = time.perf_counter()
+            player.step(wanted)
+            if player.fallen():
+                player.stand()
+            window.sync()
+            time.sleep(max(0.0, player.facts["dt"] - (time.perf_counter() - start)))
+
+
+def walk(player, command, seconds):
+    """Follow one command; returns the mean velocity in the base frame (forward, sideways, turning), and falls."""
+    seen, falls = [], 0
+    for _ in range(round(seconds / player.facts["dt"])):
+        player.step(command)
+        read = player.readings(command)
+        seen.append([*read["lin_vel"][:2], read["ang_vel"][2]])
+        if player.fallen():
+            falls += 1
+            player.stand()
+    return np.mean(seen[len(seen) // 4 :], axis=0), falls
+
+
+def fail(text):
+    """One line, exit code 2."""
+    print(f"error: {text}", file=sys.stderr)
+    sys.exit(2)
+
+
+def main(args):
+    try:
+        player = Player(args.policy)
+    except ImportError:
+        fail("onnxruntime is missing: pip install -r requirements-export.txt")
+    except Exception:  # onnxruntime has an error class for each way in which a file can be bad
+        fail(f"{args.policy} is not a policy; write one with ppo_finetune.py --eval POLICY --export FILE")
+    unknown = player.shapes.keys() - player.readings(args.command).keys() - {"prop_history", "action_history"}
+    if unknown:
+        fail(f"{args.policy} reads {', '.join(sorted(unknown))}, which only our environments can give")
+    if args.viewer:
+        return watch(player, args.command)
+    velocity, falls = walk(player, args.command, args.seconds)
+    print(f"commanded {np.round(args.command, 2)}, moved {np.round(velocity, 2)} [m/s, m/s, rad/s], {falls} falls")
+    return None
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Args, description=__doc__))
