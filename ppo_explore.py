@@ -667,8 +667,8 @@ def explore(args):
     net = ActorCritic(args.hidden, env.action_dim, args.init_std)
     member = PIDM(MEMBER, 2 * env.action_dim)
     opt, member_opt = optax.scale_by_adam(), optax.adam(args.ensemble_lr)
-    state = init_state(args, env, net, opt, member, member_opt)
-    state, rows, out, files = open_run(args, env, iterations, state)
+    fresh = partial(init_state, args, env, net, opt, member, member_opt)
+    state, rows, out, files = open_run(args, env, iterations, fresh)
     print("  ".join(f"{name}={value}" for name, value in dataclasses.asdict(args).items()), flush=True)
     shardings = devices.of_state(state, axis=0)
     state = devices.place(state, shardings)
@@ -690,12 +690,16 @@ def explore(args):
     return state
 
 
-def open_run(args, env, iterations, state):
-    """State to start from, rows so far, the run's folder and its arrays; on hosts other than the first no folder."""
+def open_run(args, env, iterations, fresh):
+    """State to start from (`fresh()` makes one), rows so far, the run's folder and its arrays.
+
+    On hosts other than the first there is no folder.
+    """
     if args.resume:
-        state, rows = records.load_state(args.resume, state)
+        state, rows = records.load_state(args.resume, jax.eval_shape(fresh))
         out = Path(args.resume)
         return state, rows, out, open_files(out, args, env, iterations)
+    state = fresh()
     if not devices.is_first():
         return state, [], None, {}
     out = records.start_run(args, env.config, args.run_dir, args.force)

@@ -809,11 +809,13 @@ def train(args):
     env = make_env(args)
     args = merge(args, env.config.ppo)
     net, opt, seeds = make_net(args, env), make_optimizer(args), one_for_each_seed(args)
-    states, rows = [init_state(a, env, net, opt) for a in seeds], [[] for _ in seeds]
     if args.resume:
-        states[0], rows[0] = records.load_state(args.resume, states[0])
+        like = jax.eval_shape(partial(init_state, args, env, net, opt))
+        states, rows = ([one] for one in records.load_state(args.resume, like))
         outs = [Path(args.resume)]
-    else:  # only now, for the checkpoint may have been refused
+    else:
+        states, rows = [init_state(a, env, net, opt) for a in seeds], [[] for _ in seeds]
+        # only now, for the checkpoint may have been refused
         outs = records.start_runs(seeds, env.config, args.force) if devices.is_first() else [None] * len(seeds)
     print(f"{args.task}: observation {env.obs_dim}, action {env.action_dim}, engine {type(env.engine).__name__}")
     print("  ".join(f"{name}={value}" for name, value in dataclasses.asdict(args).items()), flush=True)

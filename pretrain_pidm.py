@@ -198,8 +198,8 @@ def read_meta(folder):
         meta = json.loads(path.read_text())
         sizes = [meta[name] for name in ("iterations", "num_steps", "num_envs", "history")]
         held_out = meta["validation_envs"]
-        sane = all(isinstance(size, int) and 0 < size < 10**9 for size in sizes)
-        sane = sane and all(isinstance(env, int) and 0 <= env < meta["num_envs"] for env in held_out)
+        sane = isinstance(held_out, list) and all(type(size) is int and 0 < size < 10**9 for size in sizes)
+        sane = sane and all(type(env) is int and 0 <= env < meta["num_envs"] for env in held_out)
         sane = sane and {"layout", "transitions", "args", "versions"} <= meta.keys() and isinstance(meta["robot"], str)
     except FileNotFoundError:
         what = "an unfinished collection (no meta.json)" if Path(folder).is_dir() else "not a folder"
@@ -216,12 +216,16 @@ def read_meta(folder):
 def read_array(folder, name, meta):
     """One memory-mapped array (iterations, T, N, ...) of a collection, or a UserError."""
     path = Path(folder) / f"{name}.npy"
+    dtype, dims = (np.bool_, 3) if name in ("first", "rough") else (np.float32, 4)
     try:
         array = np.load(path, mmap_mode="r", allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise records.UserError(f"cannot read {path}: {error}; collect the data again") from None
+    except Exception as error:  # numpy parses a header, and has no class for all that can be wrong with one
+        why = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise records.UserError(f"cannot read {path}: {why}; collect the data again") from None
     if array.shape[:3] != (meta["iterations"], meta["num_steps"], meta["num_envs"]):
         raise records.UserError(f"{path} has shape {array.shape}, which meta.json does not name; collect it again")
+    if array.dtype != dtype or array.ndim != dims:
+        raise records.UserError(f"{path} holds {array.dtype} in {array.ndim} dimensions; collect the data again")
     return array
 
 

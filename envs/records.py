@@ -14,6 +14,8 @@ import platform
 import signal
 import subprocess
 import sys
+import types
+import typing
 from pathlib import Path
 
 import flax
@@ -205,13 +207,30 @@ def resumed(args):
     path = Path(args.resume) / "args.json"
     try:
         record = json.loads(path.read_text())
-        names = [field.name for field in dataclasses.fields(args) if field.name in record]
-        found = type(args)(**{n: tuple(record[n]) if isinstance(record[n], list) else record[n] for n in names})
+        fields = [field for field in dataclasses.fields(args) if field.name in record]
+        sane = all(fits(record[field.name], field.type) for field in fields)
     except OSError as error:
         raise UserError(f"cannot resume from {path}: {error.strerror}") from None
-    except (ValueError, TypeError):
-        raise UserError(f"{path} is damaged; start the run again") from None
-    return dataclasses.replace(found, resume=args.resume, run_dir=args.resume, force=False)
+    except (ValueError, TypeError, RecursionError):
+        sane = False
+    if not sane:
+        raise UserError(f"{path} is damaged; start the run again")
+    found = {f.name: tuple(record[f.name]) if isinstance(record[f.name], list) else record[f.name] for f in fields}
+    return type(args)(**found | {"resume": args.resume, "run_dir": args.resume, "force": False})
+
+
+def fits(value, kind):
+    """Whether a value read from JSON is what the annotation of an argument says, and no absurd number."""
+    inner = typing.get_args(kind)
+    if typing.get_origin(kind) in (types.UnionType, typing.Union):
+        return any(fits(value, one) for one in inner)
+    if typing.get_origin(kind) is typing.Literal:
+        return value in inner
+    if typing.get_origin(kind) is tuple:
+        return isinstance(value, list) and len(value) < 100 and all(fits(one, inner[0]) for one in value)
+    if kind is float:
+        return type(value) in (int, float) and abs(value) < 1e12
+    return type(value) is kind and not (kind is int and abs(value) >= 2**31)
 
 
 def check_shapes(path, params, like):

@@ -89,19 +89,19 @@ def load_run(folder):
         with (folder / "metrics.csv").open() as file:
             rows = list(csv.DictReader(file))
         columns = {name: np.array([float(row[name]) for row in rows]) for name in rows[0]}
-        complete = columns["env_steps"][-1] >= record["total_steps"]
+        complete = bool(columns["env_steps"][-1] >= float(record["total_steps"]))
         keys = ("num_envs", "num_steps", "total_steps", "lr", "num_epochs", "mirror_coef", "config")
         run = {
             "columns": columns,
             "iteration": columns["iteration"],
             "indicator": columns["progress" if "progress" in columns else "episode_return"],
-            "errors": result.get("task", {}),
+            "errors": dict(result.get("task", {})),
             "settings": {key: record[key] for key in keys},
             "seed": record["seed"],
             "versions": record["versions"],
         }
-    except (OSError, ValueError, KeyError, TypeError, IndexError) as error:
-        return left_out(folder, error)
+    except (OSError, ValueError, KeyError, TypeError, IndexError, AttributeError) as error:
+        return left_out(folder, repr(error))
     return run if complete else left_out(folder, "stopped before its last step")
 
 
