@@ -95,7 +95,7 @@ def memory():
     return stats["peak_bytes_in_use"] / 2**20 if "peak_bytes_in_use" in stats else kib / 1024
 
 
-def training(task, num_envs=None, hidden=None, num_seeds=1, iterations=40):
+def training(task, num_envs=None, hidden=None, num_seeds=1, iterations=20):
     """Steps per second of ppo_finetune.py after its first row, compile time, and time from start to that row."""
     ppo = envs.TASKS[task][1].ppo["cpu"]
     num_envs = num_envs or 512
