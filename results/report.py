@@ -424,7 +424,7 @@ def main(args):
         records.replace_text(path, text)
     draw_curves(study, STUDY / "curves.png")
     draw_updates(study, STUDY / "updates.png")
-    print(pages[ROOT / "results/README.md"])
+    print("\n".join(table_1(study)))
     return None
 
 

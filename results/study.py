@@ -51,7 +51,6 @@ GRID = {  # task -> methods; blind tasks first
     **dict.fromkeys(("anymal_climb_up", "anymal_climb_down"), (*TABLE_1, *ABLATIONS)),
     **dict.fromkeys(("anymal_crouch", "anymal_jump", "anymal_parkour_walk"), TABLE_1),
 }
-STEPS = {"cpu": {"go1_loco": 8_000_000}}  # where PIDM random needs more than the preset's to converge
 KEPT = ("args.json", "metrics.csv", "eval.json")
 
 
@@ -88,8 +87,6 @@ class Cell:
         robot = envs.TASKS[self.task][1].robot
         words = ["--task", self.task, "--preset", self.scale, "--seed", str(self.seed)]
         words += [word.format(robot=robot) for word in METHODS[self.method]]
-        steps = STEPS.get(self.scale, {}).get(self.task)
-        words += ["--total-steps", str(steps)] if steps else []
         return [*words, "--run-dir", f"runs/{self.folder}", "--force"]
 
     def done(self):
