@@ -832,9 +832,9 @@ def train(args):
     start = last - (rows[0][-1]["seconds"] if rows[0] else 0.0)
     with records.Reporter(iterations, SHOWN) as reporter:
         while int(states.iteration[0]) < iterations and not reporter.stopped:
-            states, metrics = chunk(states)
+            before, (states, metrics) = states, chunk(states)
             now = time.perf_counter()
-            keep(seeds, outs, states, jax.device_get(metrics), rows, now - start)
+            keep(seeds, outs, before, states, jax.device_get(metrics), rows, now - start)
             speed = args.num_seeds * args.log_every * args.num_envs * args.num_steps / (now - last)
             reporter.show(records.mean_row([own[-1] for own in rows]), speed)
             last = now
@@ -850,10 +850,11 @@ def train(args):
     return states
 
 
-def keep(seeds, outs, states, metrics, rows, seconds):
+def keep(seeds, outs, before, states, metrics, rows, seconds):
     """A chunk is done: add a row to each seed's metrics.csv, and replace its policy if its weights are sound.
 
-    On hosts other than the first, whose `outs` are None, rows are made but not written.
+    If they are not, the state from before the chunk is kept and UserError raised. On hosts other than the first, whose
+    `outs` are None, rows are made but not written.
     """
     for i, (args, out) in enumerate(zip(seeds, outs, strict=True)):
         params, own = jax.tree.map(lambda x, i=i: x[i], (states.params, metrics))
@@ -861,7 +862,11 @@ def keep(seeds, outs, states, metrics, rows, seconds):
         if out:
             records.save_rows(out / "metrics.csv", rows[i])
         if not all(jnp.isfinite(x).all() for x in jax.tree.leaves(params)):
-            raise records.UserError(f"weights are not finite after iteration {states.iteration[i]}; lower --lr")
+            save_states(outs, before, [own[: len(rows[0]) - 1] for own in rows])
+            raise records.UserError(
+                f"weights are not finite after iteration {states.iteration[i]}; lower --lr. To see what happened: "
+                f"python results/replay.py {args.run_dir}"
+            )
         if out:
             records.save(out / "policy.msgpack", params, {"task": args.task, "args": dataclasses.asdict(args)})
 
