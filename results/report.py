@@ -3,17 +3,19 @@
     python results/report.py
     python results/report.py --check
     python results/report.py --beside runs/demo
+    python results/report.py --live runs/demo
 
 The indicator of a task is the paper's: mean return of the noisy policy, for parkour the curriculum's progress. Final
 performance is its mean over the last 5% of rows; iterations to converge, the first at which it reaches 90% of PIDM
 random's final performance; both are percentages against PIDM random. Brackets are 95% bootstrap intervals over seeds.
 --check fails if a page on disk is not what the runs give; --beside draws a run of yours with the recorded ones of its
-task.
+task; --live redraws the curve.png of a run of ppo_explore.py or ppo_finetune.py while it goes on.
 """
 
 import csv
 import json
 import sys
+import time
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -71,6 +73,7 @@ DRAWS = 10_000  # bootstrap samples
 class Args:
     check: bool = False  # compare with the pages on disk instead of writing them
     beside: str | None = None  # a run folder: draw its curve with those of the study
+    live: str | None = None  # a run folder: redraw its curve.png every ten seconds until it has made its steps
 
 
 # --- Runs ---
@@ -405,10 +408,36 @@ def beside(folder):
     print(f"wrote {path}")
 
 
+def live(folder, seconds=10.0):
+    """Redraw curve.png of a run until it has made its steps, or until Ctrl-C; UserError if it is no such run."""
+    import ppo_explore
+    import ppo_finetune
+
+    shown = 0
+    while True:
+        try:
+            record = json.loads((folder / "args.json").read_text())
+            script = {"task": ppo_finetune, "robot": ppo_explore}[next(n for n in ("task", "robot") if n in record)]
+            with (folder / "metrics.csv").open() as file:
+                rows = [{name: float(value) for name, value in row.items()} for row in csv.DictReader(file)]
+            steps, wanted = rows[-1]["env_steps"], record["total_steps"]
+        except (OSError, ValueError, KeyError, IndexError, StopIteration) as error:
+            raise records.UserError(f"{folder} has no rows of ppo_explore.py or ppo_finetune.py: {error!r}") from None
+        if len(rows) > shown:
+            script.plot(rows, folder / "curve.png")
+            shown = len(rows)
+            print(f"{folder}/curve.png: {steps / 1e6:.2f} of {wanted / 1e6:.2f} M steps", flush=True)
+        if steps >= wanted:
+            return
+        time.sleep(seconds)
+
+
 def main(args):
     """Write the pages and figures, or with --check exit 1 where a page differs from the one on disk."""
     if args.beside:
         return beside(Path(args.beside))
+    if args.live:
+        return live(Path(args.live))
     study = load_study("cpu")
     if not study:
         raise records.UserError("results/study has no finished runs; run results/study.py")

@@ -1,10 +1,12 @@
 """The report's metrics on curves whose answers are known by hand, and runs that it must leave out."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
 
+from envs import records
 from results import report
 
 
@@ -95,3 +97,14 @@ def test_bad_runs_are_left_out_with_a_warning(study, capsys):
     (target / "metrics.csv").write_text(text[:-5] + "\n")
     assert set(report.load_task(folder)) == {"mlp"}
     assert "left out" in capsys.readouterr().err
+
+
+def test_live_draws_until_the_run_is_over(tmp_path, capsys):
+    run = tmp_path / "run"
+    shutil.copytree(report.ROOT / "results/tasks/go1_loco", run)
+    (run / "curve.png").unlink()
+    report.main(report.Args(live=str(run)))
+    assert (run / "curve.png").stat().st_size > 10_000 and "4.06 of 4.00 M steps" in capsys.readouterr().out
+    (run / "metrics.csv").write_text("env_steps\n")
+    with pytest.raises(records.UserError, match="has no rows"):
+        report.main(report.Args(live=str(run)))
