@@ -56,6 +56,7 @@ class Args:
     hidden: tuple[int, ...] | None = None  # widths of the trained MLP; None: the task's
     peers: str | None = None  # Python that has the peers' packages
     machine: str = "cpu"  # name of the results
+    label: str = ""  # added to the parts' names, so that they stand beside what was measured before
     limit_s: float = 400.0  # for one figure
     cell: str | None = None  # internal: measure one figure and print it
 
@@ -271,7 +272,7 @@ def main(args):
         for row in ROWS[part](args):
             rows.append(row)
             print("  ".join(f"{name} {as_text(value)}" for name, value in row.items()), flush=True)
-        known[part] = {"machine": here, "rows": rows}
+        known[f"{part} {args.label}".strip()] = {"machine": here, "rows": rows}
         out.mkdir(parents=True, exist_ok=True)
         path.write_text(json.dumps(known, indent=1) + "\n")
     write_page(out)
