@@ -106,10 +106,11 @@ def test_only_the_first_host_prints_and_writes(runs):
     assert hosts == one - {records.STATE}  # of which no host has all
 
 
-def test_stages_one_and_two_on_two_devices(tmp_path):
-    """Data of two devices are those of one, and so is the PIDM that comes of them."""
+def test_stage_one_on_two_hosts_and_stage_two_on_two_devices(tmp_path):
+    """Data of two processes are those of one, and so is the PIDM that two devices make of them."""
     collect = ["ppo_explore.py", "--robot", "go1", *SMOKE, "--total-steps", "128", "--run-dir"]
-    finish(start([*collect, tmp_path / "one"]), start([*collect, tmp_path / "two"], TWO))
+    finish(start([*collect, tmp_path / "one"]))
+    finish(*hosts([*collect, tmp_path / "two"]))
     arrays = [np.load(tmp_path / name / "x.npy") for name in ("one", "two")]
     np.testing.assert_allclose(arrays[0][0], arrays[1][0], atol=1e-3)  # joint velocities are of order 5
     assert np.abs(arrays[0] - arrays[1]).mean() < 0.01
