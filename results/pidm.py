@@ -282,4 +282,5 @@ def main(args):
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args, description=__doc__))
+    with records.one_line_errors():
+        main(tyro.cli(Args, description=__doc__))
