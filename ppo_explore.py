@@ -45,6 +45,7 @@ class Args:
     run_dir: str | None = None  # None: runs/explore/<robot>/seed<seed>
     force: bool = False  # overwrite the data in that folder
     resume: str | None = None  # a run folder: go on where it stopped; all other arguments are those of that run
+    tensorboard: bool = False  # every row goes to TensorBoard event files in the run folder as well
     save_minutes: float = 2.0  # what --resume needs is written this often, and when interrupted
     log_every: int | None = None  # iterations per jitted chunk and CSV row
     # --- Data ---
@@ -711,7 +712,7 @@ def fill(args, chunk, state, rows, out, files):
     last = saved = time.perf_counter()
     start = last - (rows[-1]["seconds"] if rows else 0.0)
     iterations = args.total_steps / (args.num_envs * args.num_steps)
-    with records.Reporter(iterations, SHOWN) as reporter:
+    with records.Reporter(iterations, SHOWN, board=out if args.tensorboard else None) as reporter:
         while int(state.iteration) < iterations and not reporter.stopped:
             done = int(state.iteration)
             state, (metrics, data) = chunk(state)

@@ -51,11 +51,15 @@ class Args:
     resume: str | None = None  # a run folder: go on where it stopped; all other arguments are those of that run
     save_minutes: float = 2.0  # what --resume needs is written this often, and at the end
     log_every: int | None = None  # iterations per jitted chunk and CSV row
+    tensorboard: bool = False  # every row goes to TensorBoard event files in the run folder as well
     # --- Evaluation ---
     eval: str | None = None  # a policy.msgpack: run it instead of training, write pictures beside it
     eval_envs: int = 64  # episodes of the evaluation, of each level where a task has levels
     level: int | None = None  # level of the evaluation and its pictures; None: all levels, pictures of level 4
     export: str | None = None  # with --eval: write that policy as an ONNX file here instead; see `export_onnx`
+    video: str | None = None  # with --eval: film the showcase, whole, as this .gif or .mp4 instead
+    viewer: bool = False  # with --eval: watch and steer the robot in a window instead; see envs/watch.py
+    web: bool = False  # the same in a browser
     # --- Environment ---
     num_envs: int | None = None  # N
     num_steps: int | None = None  # T, per iteration and environment
@@ -698,6 +702,38 @@ def run_eval(args):
         print(f"wrote {picture}")
 
 
+def film(args):
+    """--eval POLICY --video FILE: the showcase from its first step to its last."""
+    from envs import render
+
+    env, path = make_env(args, **showcase(args)), Path(args.video)
+    net, params = load_policy(args, env)
+    try:
+        render.check_video(path)
+        _, start, qpos = jax.jit(lambda p: evaluate(env, net, p, 1))(params)
+        render.video(env, qpos, start, path)
+    except ValueError as error:
+        raise records.UserError(str(error)) from None
+    print(f"wrote {path}")
+
+
+def watch_live(args):
+    """--eval POLICY --viewer or --web: a person commands, pushes and picks the level; see envs/watch.py."""
+    from envs import watch
+
+    env = make_env(args)
+    if "time_left" not in env.OBS:
+        env = make_env(args, episode_seconds=3600.0)  # no need to start again after 20 s
+    net, params = load_policy(args, env)
+    levels(args, env)  # refuses a level where there is none
+
+    def act(state):
+        return net.apply(params, net_inputs(net, state.obs, state.history), method=net.mean)
+
+    robot = watch.Watched(env, act, args.level)
+    return watch.window(robot) if args.viewer else watch.browser(robot)
+
+
 def levels(args, env):
     """Levels to evaluate; None for a task that has none."""
     if not hasattr(env, "at_level"):
@@ -830,7 +866,8 @@ def train(args):
     print(f"compiled in {time.perf_counter() - start:.1f} s", flush=True)
     last = saved = time.perf_counter()
     start = last - (rows[0][-1]["seconds"] if rows[0] else 0.0)
-    with records.Reporter(iterations, SHOWN) as reporter:
+    board = args.run_dir if args.tensorboard and devices.is_first() else None
+    with records.Reporter(iterations, SHOWN, board=board) as reporter:
         while int(states.iteration[0]) < iterations and not reporter.stopped:
             before, (states, metrics) = states, chunk(states)
             now = time.perf_counter()
@@ -877,16 +914,23 @@ def save_states(outs, states, rows):
         records.save_state(out, jax.tree.map(lambda x, i=i: x[i], states), own)
 
 
+def use_of(args):
+    """Which of the functions above the arguments ask for. UserError if they ask for several."""
+    uses = {"export": export_onnx, "video": film, "viewer": watch_live, "web": watch_live}
+    asked = [name for name in uses if getattr(args, name)]
+    if asked and not args.eval:
+        raise records.UserError(f"--{asked[0]} is for a trained policy; say which with --eval POLICY")
+    if len(asked) > 1:
+        raise records.UserError(f"--{asked[0]} and --{asked[1]} are two things; ask for one")
+    return uses[asked[0]] if asked else run_eval if args.eval else train
+
+
 def main(args):
     """Train, or evaluate with --eval. What a user can mend ends in one line and exit code 2."""
     with records.one_line_errors():
         devices.join(args.distributed)
         args = records.resumed(args) if args.resume else args
-        if args.export and not args.eval:
-            raise records.UserError("--export writes a trained policy; say which with --eval POLICY")
-        if args.export:
-            return export_onnx(args)
-        return run_eval(args) if args.eval else train(args)
+        return use_of(args)(args)
 
 
 if __name__ == "__main__":

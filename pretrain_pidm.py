@@ -41,6 +41,7 @@ class Args:
     run_dir: str | None = None  # None: runs/pidm/<robot>/seed<seed>
     force: bool = False  # overwrite the run in that folder
     resume: str | None = None  # a run folder: go on after its last epoch; all other arguments are those of that run
+    tensorboard: bool = False  # every row goes to TensorBoard event files in the run folder as well
     distributed: bool = False  # one of several processes, one a host; process 0 writes the files
     # --- Data ---
     num_samples: int | None = None  # train on this many transitions, drawn at random; None: all (paper: 7 M)
@@ -475,7 +476,7 @@ def run_epochs(args, env, net, dataset, order, step, carry, out, rows):
     few = np.sort(np.random.default_rng(args.seed).permutation(dataset.validation)[:50_000])
     start = time.perf_counter() - (rows[-1]["seconds"] if rows else 0.0)
     names = ("train_error", "error", "normalized_error", "last_action_error")
-    with records.Reporter(args.epochs, names, over="samples") as reporter:
+    with records.Reporter(args.epochs, names, "samples", board=out if args.tensorboard else None) as reporter:
         while len(rows) < args.epochs and not reporter.stopped:
             last = time.perf_counter()
             carry, loss = run_epoch(args, dataset, order, step, carry, len(rows))

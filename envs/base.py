@@ -188,6 +188,7 @@ class Env:
     bootstrap_time_outs = True  # V(final_obs) follows a time limit; not where the policy sees the time left
     SHOWCASE: dict = {}  # config fields for the pictures of a trained policy
     FILM: dict = {}  # which part of an episode they show; see render.film
+    COMMAND: dict[str, tuple] = {}  # what a person who watches may ask for: name -> (low, high); see `tell`
 
     def __init__(self, config, engine="auto"):
         self.config, self.robot = config, ROBOTS[config.robot]
@@ -266,6 +267,10 @@ class Env:
     def task_metrics(self, task, motion, truncated):
         """Numbers to log, by name."""
         return {}
+
+    def told(self, task, wanted):
+        """The task state when a person asks for `wanted`, a number for each name of COMMAND."""
+        return task
 
     # --- shared ---
 
@@ -450,6 +455,17 @@ class Env:
     def task_inputs(self, task, motion, clock):
         """Observation blocks that are the task's own (commands, scans)."""
         return {}
+
+    def tell(self, state, wanted):
+        """The state in which a person's command holds and the observation says so. wanted (len(COMMAND),)."""
+        task = self.told(state.task, wanted)
+        inputs, obs, start = self.task_inputs(task, self.motion(state.physics), state.clock), state.obs, 0
+        for name, (kind, scale) in self.OBS.items():
+            stop = start + self.width(kind)
+            if name in inputs:
+                obs = obs.at[start:stop].set(inputs[name] * jnp.array(scale))
+            start = stop
+        return state.replace(task=task, obs=obs)
 
     # --- kinematics ---
 

@@ -49,6 +49,7 @@ class Locomotion(Env):
     }
 
     SHOWCASE = {"fixed_velocity": (0.8, 0.0), "spawn_yaw": 0.0, "spawn_xy": 0.0}
+    COMMAND = {"forward [m/s]": (-1.0, 1.0), "sideways [m/s]": (-1.0, 1.0), "turning [rad/s]": (-1.0, 1.0)}
 
     def __init__(self, config, engine="auto"):
         super().__init__(config, engine)
@@ -74,6 +75,9 @@ class Locomotion(Env):
         """Turn towards the heading; stand if the command says so."""
         turn = jnp.clip(0.5 * wrap(task.heading - yaw), -self.config.yaw_rate, self.config.yaw_rate)
         return task.replace(command=jnp.where(task.moves, task.command.at[2].set(turn), 0.0))
+
+    def told(self, task, wanted):
+        return task.replace(command=wanted)
 
     def track(self, task, motion):
         return task.tick(motion.foot_contact, self.dt)

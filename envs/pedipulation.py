@@ -44,6 +44,7 @@ class Pedipulation(Env):
     OBS = BODY | {"target": ("polar", 1.0)}
 
     SHOWCASE = {"fixed_point": (0.7, -0.2, 0.5)}
+    COMMAND = {"x [m]": (0.0, 1.0), "y [m]": (-0.4, 0.2), "z [m]": (-0.1, 1.3)}
 
     def __init__(self, config, engine="auto"):
         super().__init__(config, engine)
@@ -74,6 +75,9 @@ class Pedipulation(Env):
         start, end = jnp.array(self.config.box), jnp.array(self.config.final_box)
         low, high = (start + difficulty / 10 * (end - start)).T
         return uniform(key, low, high, (3,))
+
+    def told(self, task, wanted):
+        return task.replace(point=wanted)
 
     def track(self, task, motion):
         error = self.foot_error(task, motion)

@@ -129,11 +129,13 @@ def start_run(args, config, folder, force):
     """
     out = Path(folder)
     refuse_overwrite(out, force)
+    if args.tensorboard:
+        tensorboard()  # rather now than when the old run is gone
     record = dataclasses.asdict(args) | {"config": dataclasses.asdict(config), "versions": versions()}
     try:
         out.mkdir(parents=True, exist_ok=True)
-        for name in ("metrics.csv", STATE):
-            (out / name).unlink(missing_ok=True)
+        for old in (out / "metrics.csv", out / STATE, *out.glob("events.out.tfevents.*")):
+            old.unlink(missing_ok=True)
         replace_text(out / "args.json", json.dumps(record, indent=1) + "\n")
     except OSError as error:
         raise UserError(f"cannot write to {out}: {error.strerror}") from None
@@ -301,13 +303,25 @@ def plot_curves(rows, names, groups, path, over="env_steps"):
     plt.close(fig)
 
 
+def tensorboard():
+    """The package that writes TensorBoard's files; UserError if it is missing."""
+    try:
+        import tensorboardX
+    except ImportError:
+        raise UserError("--tensorboard needs tensorboardX: pip install -r requirements-watch.txt") from None
+    return tensorboardX
+
+
 class Reporter:
     """Progress: a live bar on a terminal, else a line a row. Ctrl-C and SIGTERM set `stopped`, to end after a row."""
 
-    def __init__(self, total, names, over="env_steps"):
-        """total: iterations of the run; names: the columns to show; over: the column that counts the work done."""
+    def __init__(self, total, names, over="env_steps", board=None):
+        """total: iterations of the run; names: the columns to show; over: the column that counts the work done.
+
+        board: a folder for TensorBoard's files, or None.
+        """
         self.total, self.names, self.over, self.bar, self.stopped = total, names, over, None, False
-        self.warned = False
+        self.warned, self.board = False, tensorboard().SummaryWriter(str(board)) if board else None
 
     def stop(self, *_):
         self.stopped = True  # an exception could strike inside the physics callback
@@ -328,11 +342,15 @@ class Reporter:
             signal.signal(sign, handler)
         if self.bar:
             self.bar.stop()
+        if self.board:
+            self.board.close()
 
     def show(self, row, speed):
         if row.get("overflow") and not self.warned:
             self.warned = True
             print("warning: the engine had no room for some contacts; raise `contacts` in envs/engine.py")
+        for name, value in row.items() if self.board else ():
+            self.board.add_scalar(name, value, int(row[self.over]))
         shown = {name: row[name] for name in self.names if name in row}
         text = f"{row[self.over] / 1e6:.2f}M {self.over.removeprefix('env_')}  {speed:,.0f}/s  {line(shown)}"
         if self.bar:

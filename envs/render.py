@@ -1,10 +1,11 @@
-"""Pictures of a rollout: a filmstrip PNG and a GIF, by MuJoCo's renderer or, where there is no OpenGL, by matplotlib.
+"""Pictures of a rollout: a filmstrip, a GIF or an MP4, by MuJoCo's renderer or, without OpenGL, by matplotlib.
 
 MuJoCo chooses its OpenGL for good when it is imported, and a broken driver can end the process. So frames are drawn
 in a second process, this file run as a script, which is tried with one OpenGL after the other.
 """
 
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -15,6 +16,7 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 WIDTH, HEIGHT = 320, 240  # [pixels] of one frame
+EVERY = 2  # control steps from frame to frame of a film
 
 
 def film(env, qpos, course, folder, start=4.0, strip_seconds=1.0, strip_frames=10, gif_seconds=4.0):
@@ -24,7 +26,7 @@ def film(env, qpos, course, folder, start=4.0, strip_seconds=1.0, strip_frames=1
     """
     qpos = np.asarray(qpos, np.float64)
     first = max(0, min(round(start / env.dt), len(qpos) - round(gif_seconds / env.dt)))
-    moving = np.arange(first, min(first + round(gif_seconds / env.dt), len(qpos)), 2)
+    moving = np.arange(first, min(first + round(gif_seconds / env.dt), len(qpos)), EVERY)
     strip = first + np.round(np.linspace(0, strip_seconds, strip_frames, endpoint=False) / env.dt).astype(int)
     strip = strip[strip < len(qpos)]
     shown = np.unique(np.concatenate([moving, strip]))
@@ -37,9 +39,40 @@ def film(env, qpos, course, folder, start=4.0, strip_seconds=1.0, strip_frames=1
         sheet.paste(frame, (place_in_sheet % 5 * WIDTH, place_in_sheet // 5 * HEIGHT))
     png, gif = folder / "rollout.png", folder / "rollout.gif"
     sheet.save(png, optimize=True)
-    frames = [images[i].quantize(64) for i in moving]
-    frames[0].save(gif, save_all=True, append_images=frames[1:], duration=round(2000 * env.dt), loop=0)
+    save_gif([images[i] for i in moving], env.dt, gif)
     return png, gif
+
+
+def save_gif(images, dt, path):
+    """Images EVERY control steps apart, as an endless GIF."""
+    frames = [image.quantize(64) for image in images]
+    frames[0].save(path, save_all=True, append_images=frames[1:], duration=round(1000 * EVERY * dt), loop=0)
+
+
+def check_video(path):
+    """ValueError unless `video` can write such a file here."""
+    if path.suffix not in (".gif", ".mp4"):
+        raise ValueError(f"{path} must end in .gif or .mp4")
+    if path.suffix == ".mp4" and not shutil.which("ffmpeg"):
+        raise ValueError("an MP4 needs the program ffmpeg; install it, or name a .gif")
+    if not path.parent.is_dir():
+        raise ValueError(f"there is no folder {path.parent}")
+
+
+def video(env, qpos, course, path):
+    """Write a rollout qpos (steps, nq) on a course as a GIF or MP4, as its name ends; see check_video."""
+    images = draw(build(env, course), np.asarray(qpos[::EVERY], np.float64), size=(480, 360))
+    if path.suffix == ".gif":
+        return save_gif(images, env.dt, path)
+    width, height = images[0].size
+    command = ["ffmpeg", "-y", "-loglevel", "error", "-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}"]
+    command += ["-r", f"{1 / (EVERY * env.dt):g}", "-i", "-", "-pix_fmt", "yuv420p", str(path)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE) as encoder:
+        for image in images:
+            encoder.stdin.write(image.tobytes())
+    if encoder.returncode:
+        raise ValueError(f"ffmpeg could not write {path}")
+    return None
 
 
 def build(env, course):
@@ -51,7 +84,7 @@ def build(env, course):
     return spec
 
 
-def draw(spec, qpos):
+def draw(spec, qpos, size=(WIDTH, HEIGHT)):
     """Images of poses (n, nq), by the first OpenGL that works, else by matplotlib."""
     model = spec.compile()
     wanted = os.environ.get("MUJOCO_GL")
@@ -60,7 +93,7 @@ def draw(spec, qpos):
         Path(folder, "model.xml").write_text(spec.to_xml())
         np.save(Path(folder, "qpos.npy"), qpos)
         for name in names:
-            command = [sys.executable, __file__, folder]
+            command = [sys.executable, __file__, folder, *map(str, size)]
             run = subprocess.run(command, env=os.environ | {"MUJOCO_GL": name}, capture_output=True, check=False)
             if run.returncode == 0:
                 return [Image.fromarray(frame) for frame in np.load(Path(folder, "frames.npy"))]
@@ -73,11 +106,11 @@ def draw(spec, qpos):
     return [stick_figure(model, data, q) for q in qpos]
 
 
-def render(folder):
-    """In the second process: poses in qpos.npy of model.xml become frames.npy (n, HEIGHT, WIDTH, 3)."""
+def render(folder, width, height):
+    """In the second process: poses in qpos.npy of model.xml become frames.npy (n, height, width, 3)."""
     model = mujoco.MjModel.from_xml_path(str(Path(folder, "model.xml")))
     data, frames = mujoco.MjData(model), []
-    with mujoco.Renderer(model, HEIGHT, WIDTH) as renderer:
+    with mujoco.Renderer(model, int(height), int(width)) as renderer:
         for qpos in np.load(Path(folder, "qpos.npy")):
             place(model, data, qpos)
             renderer.update_scene(data, camera="track")
@@ -120,4 +153,4 @@ def stick_figure(model, data, qpos):
 
 
 if __name__ == "__main__":
-    render(sys.argv[1])
+    render(*sys.argv[1:])

@@ -4,8 +4,8 @@
     python results/play_onnx.py go1.onnx --command 0.8 0 0 --seconds 10
     python results/play_onnx.py go1.onnx --viewer
 
-With --viewer a window opens in which the arrow keys change the forward velocity and the turning rate, comma and full
-stop the sideways velocity, and the space bar stops. Needs requirements-export.txt; works for the locomotion tasks.
+With --viewer a window opens in which the arrow keys change the forward velocity and the turning rate, 7 and 9 the
+sideways velocity, and the space bar stops. Needs requirements-export.txt; works for the locomotion tasks.
 """
 
 import json
@@ -19,15 +19,30 @@ import numpy as np
 import tyro
 
 ROOT = Path(__file__).resolve().parent.parent
-LIMIT = (1.0, 1.0, 1.0)  # of the command: m/s, m/s, rad/s
-KEYS = {  # GLFW key codes -> change of the command
-    265: (0.1, 0, 0),  # up
-    264: (-0.1, 0, 0),  # down
-    ord(","): (0, 0.1, 0),
-    ord("."): (0, -0.1, 0),
-    263: (0, 0, 0.1),  # left
-    262: (0, 0, -0.1),  # right
+LIMIT = np.ones(3)  # of the command: m/s, m/s, rad/s
+
+
+# >>> copy: keys (owner: results/play_onnx.py)
+KEYS = {  # GLFW key codes, none of which the window uses itself -> which number of the command changes, and its sign
+    265: (0, 1),  # up
+    264: (0, -1),  # down
+    ord("7"): (1, 1),
+    ord("9"): (1, -1),
+    263: (2, 1),  # left
+    262: (2, -1),  # right
 }
+
+
+def pressed(key, command, low, high):
+    """The command (3,) after a key: a twentieth of its range further, or 0 (as near as it goes) for the space bar."""
+    change = np.zeros(len(command))
+    if key in KEYS:
+        index, side = KEYS[key]
+        change[index] = side * (high[index] - low[index]) / 20
+    return np.clip(command * (key != ord(" ")) + change, low, high)
+
+
+# <<< copy: keys
 
 
 @dataclass(frozen=True)
@@ -110,7 +125,7 @@ def watch(player, command):
     wanted = np.array(command, float)
 
     def press(key):
-        wanted[:] = 0.0 if key == ord(" ") else np.clip(wanted + KEYS.get(key, 0.0), np.negative(LIMIT), LIMIT)
+        wanted[:] = pressed(key, wanted, -LIMIT, LIMIT)
 
     with mujoco.viewer.launch_passive(player.model, player.data, key_callback=press) as window:
         while window.is_running():

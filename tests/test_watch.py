@@ -1,0 +1,241 @@
+"""A person's commands reach the robot, in a window or a browser; films and TensorBoard files are written."""
+
+import dataclasses
+import shutil
+import struct
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from PIL import Image
+
+import envs
+import ppo_finetune as script
+from envs import watch
+
+ROOT = Path(__file__).resolve().parent.parent
+WALKER = ROOT / "results/tasks/go1_loco/policy.msgpack"
+ARGS = script.Args(task="go1_loco", eval=str(WALKER))
+
+
+def stand(state):
+    return jnp.zeros_like(state.action)
+
+
+@pytest.fixture(scope="module")
+def walker():
+    """The recorded Go1, watched."""
+    env = envs.make("go1_loco", "c")
+    net, params = script.load_policy(ARGS, env)
+    return watch.Watched(env, lambda s: net.apply(params, {"obs": s.obs}, method=net.mean))
+
+
+@pytest.fixture(scope="module")
+def climber():
+    return watch.Watched(envs.make("anymal_climb_up", "c"), stand, level=2)
+
+
+@pytest.mark.parametrize(("task", "block"), [("go1_loco", "command"), ("anymal_pedipulation", "target")])
+def test_a_command_changes_the_task_and_its_part_of_the_observation(task, block, jitted):
+    """What was there before the command is what a task of that command would have shown; nothing else changes."""
+    env = jitted(task).env
+    before = jax.jit(env.reset)(jax.random.key(0))
+    wanted = np.array([0.3, -0.2, 0.1])
+    after = env.tell(before, jnp.asarray(wanted))
+    stop = np.cumsum([env.width(kind) for kind, _ in env.OBS.values()])
+    where = list(env.OBS).index(block)
+    changed = np.flatnonzero(np.asarray(before.obs != after.obs))
+    assert changed.size and set(changed) <= set(range(stop[where] - 3, stop[where]))
+    shown = np.asarray(after.obs[stop[where] - 3 : stop[where]]) / np.array(env.OBS[block][1])
+    if task == "anymal_pedipulation":  # a point of the world, seen from a base that stands level
+        yaw = float(2 * np.arctan2(before.physics.qpos[6], before.physics.qpos[3]))
+        turn = np.array([[np.cos(yaw), np.sin(yaw), 0], [-np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])
+        wanted = turn @ (wanted - np.asarray(before.physics.qpos[:3]))
+    np.testing.assert_allclose(shown, wanted, atol=1e-5)
+
+
+def test_the_robot_goes_where_it_is_told(walker):
+    """Forward, then backward: the recorded policy follows within 0.25 m/s."""
+    for command in (0.8, -0.6):
+        walker.want(0, command)
+        speeds = []
+        for _ in range(120):
+            walker.tick()
+            speeds.append(float(walker.env.motion(walker.state.physics).lin_vel[0]))
+        assert abs(np.mean(speeds[60:]) - command) < 0.25, (command, np.mean(speeds[60:]))
+    walker.show()
+    np.testing.assert_allclose(walker.data.xpos[1], walker.state.physics.qpos[:3], atol=1e-6)
+
+
+def test_keys(walker):
+    walker.press(ord(" "))
+    assert not walker.command.any()
+    for key in (265, 265, 263, ord("9")):
+        walker.press(key)
+    np.testing.assert_allclose(walker.command, [0.2, -0.1, 0.1])
+    for _ in range(30):
+        walker.press(264)
+    assert walker.command[0] == -1.0, "within its range"
+    before = np.asarray(walker.state.physics.qvel)
+    walker.press(watch.PUSH_KEY)
+    assert np.hypot(*walker.kick) == pytest.approx(watch.PUSH)
+    walker.tick()
+    assert not walker.kick.any() and np.hypot(*(walker.state.physics.qvel - before)[:2]) > 0.3
+
+
+def test_levels(climber):
+    def top():
+        return float(np.max(climber.state.physics.mocap_pos[:, 2] + climber.env.half[:, 2]))
+
+    heights = []
+    for level in (2, 9, 99):
+        climber.to_level(level)
+        climber.tick()
+        assert int(climber.state.task.level) == min(level, 9)
+        heights.append(top())
+    climber.press(267)
+    climber.tick()
+    assert int(climber.state.task.level) == 8 and heights[0] < heights[1]
+    climber.paused, clock = True, int(climber.state.clock)
+    climber.tick()
+    assert int(climber.state.clock) == clock
+    climber.paused = False
+    climber.tick()
+    assert int(climber.state.clock) == clock + 1
+    np.testing.assert_allclose((climber.show(), climber.data.mocap_pos)[1], climber.state.physics.mocap_pos, atol=1e-6)
+
+
+class Gui:
+    """Stands for viser's: remembers what each control does."""
+
+    def __init__(self):
+        self.does = {}
+
+    def control(self, name, *_, **__):
+        return SimpleNamespace(**dict.fromkeys(("on_update", "on_click"), lambda do: self.does.update({name: do})))
+
+    add_slider = add_checkbox = add_button = control
+
+    def use(self, name, value=None):
+        self.does[name](SimpleNamespace(target=SimpleNamespace(value=value)))
+
+
+def test_controls_of_the_page(walker, climber):
+    gui = Gui()
+    watch.add_controls(gui, walker)
+    assert "level" not in gui.does
+    gui.use("turning [rad/s]", 0.7)
+    gui.use("pause", True)
+    assert walker.command[2] == 0.7 and walker.paused
+    gui.use("pause", False)
+    gui.use("start again")
+    walker.tick()
+    assert int(walker.state.clock) == 0
+    gui = Gui()
+    watch.add_controls(gui, climber)
+    gui.use("level", 7)
+    climber.tick()
+    assert int(climber.state.task.level) == 7 and not climber.env.COMMAND
+
+
+def test_the_page_is_served(walker):
+    """Needs requirements-watch.txt: the page answers while the robot walks on."""
+    pytest.importorskip("mjviser")
+    import urllib.request
+
+    start, pages = int(walker.state.clock), []
+
+    def alive():
+        with urllib.request.urlopen("http://localhost:8123", timeout=20) as page:
+            pages.append(page.read())
+        return len(pages) < 4
+
+    watch.browser(walker, port=8123, alive=alive)
+    assert b"<html" in pages[0].lower() and int(walker.state.clock) == start + 3
+
+
+def test_what_cannot_be_watched_is_refused(refused, monkeypatch):
+    def change(**changes):
+        return dataclasses.replace(ARGS, **changes)
+
+    monkeypatch.setitem(sys.modules, "mjviser", None)
+    refused(script.main, change(web=True), "requirements-watch.txt")
+    monkeypatch.setattr(sys, "platform", "linux")
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    refused(script.main, change(viewer=True), "needs a display", "--web")
+    refused(script.main, change(viewer=True, web=True), "--viewer and --web", "ask for one")
+    refused(script.main, script.Args(web=True), "--eval POLICY")
+    refused(script.main, change(web=True, level=3), "no levels")
+
+
+def test_films(tmp_path, monkeypatch, capsys):
+    """Twenty seconds, 25 frames each second, as a GIF; an MP4 where ffmpeg is."""
+    drawn = []
+
+    def draw(spec, qpos, size):
+        drawn.append(np.asarray(qpos))
+        return [Image.new("RGB", size, (i % 255, 0, 0)) for i in range(len(qpos))]
+
+    monkeypatch.setattr("envs.render.draw", draw)
+    kinds = [".gif"] + ([".mp4"] if shutil.which("ffmpeg") else [])
+    for kind in kinds:
+        path = tmp_path / f"walk{kind}"
+        script.main(dataclasses.replace(ARGS, video=str(path)))
+        assert f"wrote {path}" in capsys.readouterr().out and path.stat().st_size > 1000
+    with Image.open(tmp_path / "walk.gif") as gif:
+        assert gif.n_frames == len(drawn[0]) == 500 and gif.info["duration"] == 40
+    assert drawn[0][-1][0] - drawn[0][0][0] > 10, "it walked"
+
+
+def test_films_that_cannot_be_written(tmp_path, refused, monkeypatch):
+    def check(name, *words):
+        refused(script.main, dataclasses.replace(ARGS, video=str(tmp_path / name)), *words)
+
+    check("a.avi", "must end in .gif or .mp4")
+    check("none/a.gif", "there is no folder")
+    monkeypatch.setattr(shutil, "which", lambda name: None)
+    check("a.mp4", "ffmpeg")
+
+
+def scalars(path):
+    """(step, name) -> value of an event file: records of a length, its checksum, a message and its checksum."""
+    from tensorboardX.proto.event_pb2 import Event
+
+    blob, found = path.read_bytes(), {}
+    while blob:
+        (size,) = struct.unpack("<Q", blob[:8])
+        event = Event.FromString(blob[12 : 12 + size])
+        found |= {(event.step, value.tag): value.simple_value for value in event.summary.value}
+        blob = blob[16 + size :]
+    return found
+
+
+def test_tensorboard_has_every_row(tmp_path):
+    """Needs requirements-watch.txt."""
+    pytest.importorskip("tensorboardX")
+    import csv
+
+    args = script.Args(preset="smoke", run_dir=str(tmp_path), tensorboard=True)
+    script.main(args)
+    (path,) = tmp_path.glob("events.out.tfevents.*")
+    found = scalars(path)
+    with (tmp_path / "metrics.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    want = {(int(float(row["env_steps"])), name): float(value) for row in rows for name, value in row.items()}
+    assert found.keys() == want.keys() and len(rows) == 2
+    np.testing.assert_allclose([found[key] for key in want], list(want.values()), rtol=1e-5)
+    script.main(dataclasses.replace(args, tensorboard=False, force=True))
+    assert not list(tmp_path.glob("events.*")), "the files of the run that was overwritten are gone"
+
+
+def test_tensorboard_without_its_package_loses_nothing(tmp_path, refused, monkeypatch):
+    args = script.Args(preset="smoke", run_dir=str(tmp_path))
+    (tmp_path / "metrics.csv").write_text("iteration\n1\n")
+    monkeypatch.setitem(sys.modules, "tensorboardX", None)
+    refused(script.main, dataclasses.replace(args, tensorboard=True, force=True), "requirements-watch.txt")
+    assert (tmp_path / "metrics.csv").read_text() == "iteration\n1\n"
