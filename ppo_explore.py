@@ -1,4 +1,4 @@
-"""Stage 1: collect exploration data of one robot, without a task (paper Sec. III-C).
+"""Stage 1: collect exploration data of one robot, without a task (paper Sec. IV-C).
 
     python ppo_explore.py --robot g1
     python ppo_explore.py --robot go1 --preset gpu
@@ -150,7 +150,7 @@ class MLP(nn.Module):
 
 
 class PIDM(nn.Module):
-    """Proprioceptive inverse dynamics model (paper Sec. III-D, Fig. 3): history and a goal to an action.
+    """Proprioceptive inverse dynamics model (paper Sec. IV-D, Fig. 3): history and a goal to an action.
 
     In pretraining the goal is the wanted change of x and goes through a delta_encoder to a prediction_decoder. In
     actor and critic the two ends have other names, are fresh, and the head also sees the embedded goal.

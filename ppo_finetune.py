@@ -1,4 +1,4 @@
-"""Stage 3: learn a robot task with PPO, from a pretrained PIDM or from nothing (paper Sec. III-E and IV).
+"""Stage 3: learn a robot task with PPO, from a pretrained PIDM or from nothing (paper Sec. IV-E and V).
 
     python ppo_finetune.py --task g1_loco --pretrained assets/pidm/g1.msgpack
     python ppo_finetune.py --task go1_loco
@@ -164,7 +164,7 @@ class MLP(nn.Module):
 
 
 class PIDM(nn.Module):
-    """Proprioceptive inverse dynamics model (paper Sec. III-D, Fig. 3): history and a goal to an action.
+    """Proprioceptive inverse dynamics model (paper Sec. IV-D, Fig. 3): history and a goal to an action.
 
     In pretraining the goal is the wanted change of x and goes through a delta_encoder to a prediction_decoder. In
     actor and critic the two ends have other names, are fresh, and the head also sees the embedded goal.
@@ -235,7 +235,7 @@ def net_inputs(net, obs, history):
 
 
 class PIDMActorCritic(nn.Module):
-    """Actor and critic each around a PIDM core of their own (paper Sec. III-E, Fig. 3).
+    """Actor and critic each around a PIDM core of their own (paper Sec. IV-E, Fig. 3).
 
     The intention encoder reads the task's observation in place of the wanted change of x, and a synthesizer replaces
     the prediction decoder. Both are fresh in every run; history_encoder and backbone may be loaded by `warm_start`.
@@ -580,7 +580,7 @@ def update(args, env, net, opt, state, roll, advantage, ret, key):
 
 
 def update_magnitude(before, after):
-    """Mean absolute change of each submodule's weights, averaged over its layers (paper Sec. IV-E, Fig. 6)."""
+    """Mean absolute change of each submodule's weights, averaged over its layers (paper Sec. V-E)."""
     changes = {}
     for branch in ("actor", "critic"):
         for name, part in before["params"][branch].items():
@@ -916,13 +916,18 @@ def save_states(outs, states, rows):
 
 def use_of(args):
     """Which of the functions above the arguments ask for. UserError if they ask for several."""
-    uses = {"export": export_onnx, "video": film, "viewer": watch_live, "web": watch_live}
-    asked = [name for name in uses if getattr(args, name)]
+    uses = {
+        "export": (args.export, export_onnx),
+        "video": (args.video, film),
+        "viewer": (args.viewer, watch_live),
+        "web": (args.web, watch_live),
+    }
+    asked = [name for name, (wanted, _) in uses.items() if wanted]
     if asked and not args.eval:
         raise records.UserError(f"--{asked[0]} is for a trained policy; say which with --eval POLICY")
     if len(asked) > 1:
         raise records.UserError(f"--{asked[0]} and --{asked[1]} are two things; ask for one")
-    return uses[asked[0]] if asked else run_eval if args.eval else train
+    return uses[asked[0]][1] if asked else run_eval if args.eval else train
 
 
 def main(args):

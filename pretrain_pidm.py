@@ -1,4 +1,4 @@
-"""Stage 2: train a robot's PIDM to name the action between two states, on the data of stage 1 (paper Sec. III-D).
+"""Stage 2: train a robot's PIDM to name the action between two states, on the data of stage 1 (paper Sec. IV-D).
 
     python pretrain_pidm.py --data runs/explore/g1/seed0
 
@@ -109,7 +109,7 @@ class MLP(nn.Module):
 
 
 class PIDM(nn.Module):
-    """Proprioceptive inverse dynamics model (paper Sec. III-D, Fig. 3): history and a goal to an action.
+    """Proprioceptive inverse dynamics model (paper Sec. IV-D, Fig. 3): history and a goal to an action.
 
     In pretraining the goal is the wanted change of x and goes through a delta_encoder to a prediction_decoder. In
     actor and critic the two ends have other names, are fresh, and the head also sees the embedded goal.
@@ -263,7 +263,7 @@ def add_noise(key, width, batch):
 
 
 def mirror_windows(tables, batch):
-    """All windows as seen in one mirror (paper Sec. III-D); tables is an entry of `Env.mirrors`."""
+    """All windows as seen in one mirror (paper Sec. V-B); tables is an entry of `Env.mirrors`."""
     kinds = {"prop": "prop", "past": "action", "next_x": "prop", "action": "action"}
     return batch | {name: batch[name][..., tables[kind][0]] * tables[kind][1] for name, kind in kinds.items()}
 
@@ -309,7 +309,7 @@ def predict(net, variables, batch):
 
 
 def l1_loss(net, variables, batch):
-    """Mean absolute error of the action [action units] (paper Sec. III-D)."""
+    """Mean absolute error of the action [action units] (paper Sec. IV-D)."""
     return jnp.abs(predict(net, variables, batch) - batch["action"]).mean()
 
 

@@ -1,4 +1,4 @@
-"""Exploration without a task, for the data of stage 1 (paper Sec. III-C): the robot sees x_t and its last action.
+"""Exploration without a task, for the data of stage 1 (paper Sec. IV-C): the robot sees x_t and its last action.
 
 The reward for what is worth seeing comes from the ensemble in ppo_explore.py; here are the regularisers that any task
 has. Every episode starts on the plane or on rough ground, with its own masses and friction, and is pushed about.

@@ -5,7 +5,7 @@
     python results/pidm.py --robots anymal_d --stages sizes
 
 Weights go to assets/pidm/<robot>.msgpack, everything else to results/pidm/<robot>. Stage `sizes` pretrains on small
-random parts of the data as well (paper Fig. 5); its weights and errors go to results/pidm/<robot>/sizes.
+random parts of the data as well (paper Sec. V-D); its weights and errors go to results/pidm/<robot>/sizes.
 """
 
 import json

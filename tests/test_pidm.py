@@ -254,7 +254,7 @@ def test_loaded_parts_start_slowly_and_scaled(pretrained, tmp_path):
 
 @pytest.mark.parametrize("name", ["anymal_loco", "go1_loco", "g1_loco"])
 def test_first_actions_are_small_wherever_the_first_rollout_gets(name, jitted):
-    """A warm-started actor still commands (nearly) the default pose: |mean| < 0.02 (paper Sec. III-E)."""
+    """A warm-started actor still commands (nearly) the default pose: |mean| < 0.02 (paper Sec. IV-E)."""
     task = jitted(name)
     env, state = task.env, task.start(16)
     path = finetune.SHIPPED / f"{env.robot.name}.msgpack"
@@ -271,7 +271,7 @@ def test_first_actions_are_small_wherever_the_first_rollout_gets(name, jitted):
 
 @pytest.mark.parametrize("task", [task for task, (_, config) in envs.TASKS.items() if "intention" not in config.ppo])
 def test_parameter_ratio(task):
-    """A PIDM has about four times the parameters of a blind task's MLP (paper Sec. IV-A)."""
+    """A PIDM has about four times the parameters of a blind task's MLP (paper Sec. V-A)."""
     env = envs.make(task, "c")
     args = finetune.merge(finetune.Args(task=task), env.config.ppo)
     counts = []

@@ -7,9 +7,11 @@ import csv
 import dataclasses
 import errno
 import functools
+import itertools
 import json
 import os
 import shutil
+import time
 
 import flax
 import jax
@@ -102,6 +104,20 @@ def test_full_disk_ends_in_one_line_and_loses_nothing(whole, tmp_path, refused, 
     ppo_finetune.main(ppo_finetune.Args(resume=str(out)))
     assert rows_of(out) == rows_of(want)
     jax.tree.map(np.testing.assert_array_equal, *(weights_of(f / "policy.msgpack") for f in (want, out)))
+
+
+def test_a_clock_that_jumps_changes_nothing_but_the_seconds(whole, tmp_path, monkeypatch):
+    """The machine's clock goes back a day, then on by two: rows, weights and what --resume needs are as without it."""
+    want, args = whole(ppo_finetune)
+    jumps, clock, wall = itertools.cycle([0.0, -86_400.0, 86_400.0]), time.perf_counter, time.time
+    for name, true in (("perf_counter", clock), ("time", wall), ("monotonic", time.monotonic)):
+        monkeypatch.setattr(time, name, lambda true=true: true() + next(jumps))
+    out = tmp_path / "jumps"
+    ppo_finetune.main(dataclasses.replace(args, run_dir=str(out)))
+    monkeypatch.undo()
+    assert rows_of(out) == rows_of(want)
+    jax.tree.map(np.testing.assert_array_equal, *(weights_of(f / "policy.msgpack") for f in (want, out)))
+    assert (out / records.STATE).stat().st_size > 1000
 
 
 def test_what_cannot_be_resumed_is_refused(whole, tmp_path, refused):
