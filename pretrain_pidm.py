@@ -263,7 +263,7 @@ def add_noise(key, width, batch):
 
 
 def mirror_windows(tables, batch):
-    """All windows as seen in one mirror (paper Sec. V-B); tables is an entry of `Env.mirrors`."""
+    """All windows as seen in one mirror (paper Sec. IV-D); tables is an entry of `Env.mirrors`."""
     kinds = {"prop": "prop", "past": "action", "next_x": "prop", "action": "action"}
     return batch | {name: batch[name][..., tables[kind][0]] * tables[kind][1] for name, kind in kinds.items()}
 

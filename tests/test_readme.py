@@ -43,7 +43,7 @@ def workplace(tmp_path_factory):
     return folder
 
 
-@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize("command", COMMANDS, ids=range(len(COMMANDS)))
 def test_commands_run(command, workplace, monkeypatch, capsys):
     words = shlex.split(command)
     if words[0] in ("#SBATCH", "make"):
@@ -74,6 +74,25 @@ def test_python_runs():
 def test_links_lead_somewhere():
     for target in re.findall(r"\]\((?!http)([^)#]+)\)", README):
         assert (ROOT / target).exists(), target
+
+
+@pytest.mark.parametrize("script", ["ppo_explore", "pretrain_pidm", "ppo_finetune"])
+def test_implementation_details_name_what_there_is(script):
+    module = importlib.import_module(script)
+    details = README.split(f"**Implementation details** of [{script}.py]")[1].split("\n\n")[1]
+    names = re.findall(r"^\d+\. (`.*?):", details, re.M)
+    assert len(names) == len(re.findall(r"^\d+\.", details, re.M)) > 4
+    for name in re.findall(r"`(\w+)`", " ".join(names)):
+        assert hasattr(module, name), name
+
+
+@pytest.mark.parametrize("script", ["ppo_explore", "pretrain_pidm", "ppo_finetune"])
+def test_arguments_that_matter_exist(script):
+    section = README.split(f"## {script}.py")[1].split("\n## ")[0]
+    table = section.split("**Arguments that matter.**")[1].split("\n\n")[1]
+    names = re.findall(r"`--([\w-]+)", table)
+    fields = {field.name for field in dataclasses.fields(importlib.import_module(script).Args)}
+    assert len(names) > 3 and {name.replace("-", "_") for name in names} <= fields
 
 
 def test_every_task_is_in_the_table():
