@@ -45,12 +45,7 @@ Part = Literal["engines", "training", "seeds", "solver", "peers"]
 @dataclass(frozen=True)
 class Args:
     tasks: tuple[str, ...] = tuple(envs.TASKS)
-    parts: tuple[Literal["engines", "training", "seeds", "solver", "peers"], ...] = (
-        "engines",
-        "training",
-        "seeds",
-        "solver",
-    )
+    parts: tuple[Part, ...] = ("engines", "training", "seeds", "solver")
     engines: tuple[Literal["c", "mjx", "warp"], ...] = ("c", "mjx")
     counts: tuple[int, ...] = (256, 1024, 4096)  # environments; mjx and warp on a CPU: 64
     hidden: tuple[int, ...] | None = None  # widths of the trained MLP; None: the task's
@@ -96,14 +91,14 @@ def memory():
     return stats["peak_bytes_in_use"] / 2**20 if "peak_bytes_in_use" in stats else kib / 1024
 
 
-def training(task, num_envs=None, hidden=None, num_seeds=1, iterations=20):
+def training(task, num_envs=None, hidden=None, num_seeds=1, extra=(), iterations=20):
     """Steps per second of ppo_finetune.py after its first row, compile time, and time from start to that row."""
     ppo = envs.TASKS[task][1].ppo["cpu"]
     num_envs = num_envs or 512
     steps = num_envs * ppo.get("num_steps", 24)
     with tempfile.TemporaryDirectory() as folder:
         words = ["--task", task, "--num-envs", num_envs, "--run-dir", folder, "--force", "--num-seeds", num_seeds]
-        words += ["--total-steps", steps * iterations, *(["--hidden", *hidden] if hidden else [])]
+        words += ["--total-steps", steps * iterations, *(["--hidden", *hidden] if hidden else []), *extra]
         start, to_first, compile_s = time.perf_counter(), None, None
         command = [sys.executable, "ppo_finetune.py", *map(str, words)]
         with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
@@ -191,9 +186,14 @@ def solver(task, limit, num_envs=64):
 
 
 def peer_rows(args):
-    """Ours beside rsl_rl on the same physics and networks, and beside Playground with Brax; 512 environments."""
+    """Ours beside rsl_rl on the same physics and networks, and beside Playground with Brax; 512 environments.
+
+    Neither has a mirror loss, so ours stands there without it as well.
+    """
     for hidden in ((128, 128, 128), (512, 256, 128)):
-        yield {"what": "ours", "hidden": hidden} | in_process(args.limit_s, "training", "go1_loco", 512, hidden)
+        for what, extra in (("ours", ()), ("ours, no mirror loss", ("--mirror-coef", 0))):
+            row = in_process(args.limit_s, "training", "go1_loco", 512, hidden, 1, extra)
+            yield {"what": what, "hidden": hidden} | row
         words = ["rsl_rl", "--hidden", *map(str, hidden)]
         yield {"what": "rsl_rl", "hidden": hidden} | run_peer(args, words)
     yield {"what": "playground", "hidden": (512, 256, 128)} | run_peer(args, ["playground"])

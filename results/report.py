@@ -338,6 +338,41 @@ def draw_updates(study, path):
     return True
 
 
+def sizes_of(robot):
+    """Transitions pretrained on -> normalised error on held-out ones, of what results/pidm.py has made."""
+    folder, found = ROOT / f"results/pidm/{robot}", {}
+    for path in [*folder.glob("sizes/*_validation.json"), folder / "validation.json"]:
+        stem = path.stem.removesuffix("validation")
+        args = json.loads(path.with_name(f"{stem}args.json").read_text())
+        count = args["num_samples"] or json.loads((folder / "explore/meta.json").read_text())["transitions"]
+        found[count] = json.loads(path.read_text())["normalized_error"]
+    return dict(sorted(found.items()))
+
+
+def draw_sizes(study, path, robot="anymal_d"):
+    """Paper Sec. V-D: error of the PIDM, and iterations to converge, over the size of its training set."""
+    errors = sizes_of(robot)
+    if len(errors) < 2:
+        return False
+    methods = dict(zip(errors, ("pidm_7k", "pidm_70k", "pidm_700k", "pidm_pretrained"), strict=False))
+    plt, fig, (left, right) = panels(2)
+    left.semilogx(list(errors), list(errors.values()), "o-")
+    left.set(xlabel="transitions", ylabel="error over action magnitude")
+    for task, runs in study.items():
+        known = {count: compare(runs, method, "to 90%") for count, method in methods.items()}
+        known = {count: value[0] for count, value in known.items() if not isinstance(value, str)}
+        if len(known) > 1:
+            right.semilogx(list(known), list(known.values()), "o-", label=TASKS[task])
+    right.set(xlabel="transitions", ylabel="iterations to 90%, against random [%]")
+    right.axhline(0.0, color="0.6", lw=1)
+    for ax in (left, right):
+        ax.grid(alpha=0.3)
+    if right.get_legend_handles_labels()[0]:
+        right.legend(fontsize=8)
+    save(plt, fig, path)
+    return True
+
+
 # --- Pages ---
 
 HEAD = """# Results
@@ -367,6 +402,11 @@ def page(study, updates):
     lines += ["## Table II: which network is pretrained", "", *ablation(study, parts, climbing), ""]
     sizes = {m: METHODS[m] for m in ("pidm_7k", "pidm_70k", "pidm_700k", "pidm_pretrained")}
     lines += ["## Size of the pretraining set", "", *ablation(study, sizes, climbing), ""]
+    errors = sizes_of("anymal_d")
+    if len(errors) > 1:
+        lines += [*markdown([{f"{count:,}": f"{error:.3f}" for count, error in errors.items()}]), ""]
+        lines += ["Error over action magnitude on held-out transitions, by the number of those trained on.", ""]
+        lines += ["![sizes](study/sizes.png)", ""]
     ran = set().union(*study.values())
     beyond = {m: METHODS[m] for m in ("pidm_shuffled", "pidm_scaled", "pidm_slow") if m in ran}
     if beyond:
@@ -453,6 +493,7 @@ def main(args):
         records.replace_text(path, text)
     draw_curves(study, STUDY / "curves.png")
     draw_updates(study, STUDY / "updates.png")
+    draw_sizes(study, STUDY / "sizes.png")
     print("\n".join(table_1(study)))
     return None
 

@@ -99,6 +99,19 @@ def test_bad_runs_are_left_out_with_a_warning(study, capsys):
     assert "left out" in capsys.readouterr().err
 
 
+def test_sizes_are_those_that_were_pretrained_on(tmp_path, monkeypatch):
+    monkeypatch.setattr(report, "ROOT", tmp_path)
+    folder = tmp_path / "results/pidm/anymal_d"
+    for stem, samples, error in (("sizes/7000_", 7000, 0.9), ("sizes/70000_", 70000, 0.6), ("", None, 0.3)):
+        for name, content in (("args", {"num_samples": samples}), ("validation", {"normalized_error": error})):
+            (folder / f"{stem}{name}.json").parent.mkdir(parents=True, exist_ok=True)
+            (folder / f"{stem}{name}.json").write_text(json.dumps(content))
+    (folder / "explore").mkdir()
+    (folder / "explore/meta.json").write_text('{"transitions": 1000000}')
+    assert report.sizes_of("anymal_d") == {7000: 0.9, 70000: 0.6, 1000000: 0.3}
+    assert report.draw_sizes({}, tmp_path / "sizes.png") and (tmp_path / "sizes.png").stat().st_size > 5000
+
+
 def test_live_draws_until_the_run_is_over(tmp_path, capsys):
     run = tmp_path / "run"
     shutil.copytree(report.ROOT / "results/tasks/go1_loco", run)
