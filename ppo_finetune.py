@@ -68,6 +68,8 @@ class Args:
     hidden: tuple[int, ...] | None = None  # widths of the MLP's hidden layers
     intention: tuple[int, ...] | None = None  # of the PIDM's intention encoder but the last; None: as in pretraining
     init_std: float | None = None  # initial action std, in action units
+    # Deviation: the paper's fresh layers are as PyTorch makes them; orthogonal ones learn faster, see README.
+    fresh: Literal["orthogonal", "pytorch"] = "orthogonal"  # first weights of all that is not loaded
     # --- Warm start, beyond the paper ---
     core_scale: float = 1.0  # multiplies the last layer of a loaded backbone, whose features are larger than fresh ones
     warm_iterations: int = 0  # iterations in which the step size of loaded parts grows from 0
@@ -150,17 +152,29 @@ SIZES = {
 }
 
 
+def dense(width, fan_in, gain, fresh):
+    """A linear layer: orthogonal weights times gain, no biases; or, as PyTorch does it, all within 1/sqrt(fan_in)."""
+
+    def pytorch(key, shape, dtype):
+        return jax.random.uniform(key, shape, dtype, -1.0, 1.0) / fan_in**0.5
+
+    if fresh == "pytorch":
+        return nn.Dense(width, kernel_init=pytorch, bias_init=pytorch)
+    return nn.Dense(width, kernel_init=nn.initializers.orthogonal(gain))
+
+
 class MLP(nn.Module):
     """Dense layers with ELU between them; the last one is linear, its weights scaled by `gain`."""
 
     widths: tuple[int, ...]
     gain: float = 2**0.5
+    fresh: str = "orthogonal"
 
     @nn.compact
     def __call__(self, x):
         for width in self.widths[:-1]:
-            x = nn.elu(nn.Dense(width, kernel_init=nn.initializers.orthogonal(2**0.5))(x))
-        return nn.Dense(self.widths[-1], kernel_init=nn.initializers.orthogonal(self.gain))(x)
+            x = nn.elu(dense(width, x.shape[-1], 2**0.5, self.fresh)(x))
+        return dense(self.widths[-1], x.shape[-1], self.gain, self.fresh)(x)
 
 
 class PIDM(nn.Module):
@@ -176,15 +190,17 @@ class PIDM(nn.Module):
     head: str = "prediction_decoder"
     goal_to_head: bool = False
     gain: float = 1.0  # of the last layer
+    fresh: str = "orthogonal"
 
     @nn.compact
     def __call__(self, history, goal):
         """history (..., (K+1) X + K A) and goal (..., G), both of order one -> (..., out_dim)."""
-        z_history = nn.elu(MLP(self.sizes.history, name="history_encoder")(history))
-        z_goal = nn.elu(MLP(self.sizes.goal, name=self.goal)(goal))
-        z = nn.elu(MLP(self.sizes.backbone, name="backbone")(jnp.concatenate([z_history, z_goal], -1)))
+        part = partial(MLP, fresh=self.fresh)
+        z_history = nn.elu(part(self.sizes.history, name="history_encoder")(history))
+        z_goal = nn.elu(part(self.sizes.goal, name=self.goal)(goal))
+        z = nn.elu(part(self.sizes.backbone, name="backbone")(jnp.concatenate([z_history, z_goal], -1)))
         z = jnp.concatenate([z, z_goal], -1) if self.goal_to_head else z
-        return MLP((*self.sizes.head, self.out_dim), self.gain, name=self.head)(z)
+        return part((*self.sizes.head, self.out_dim), self.gain, name=self.head)(z)
 
 
 def standardise(norm, name, x):
@@ -208,11 +224,12 @@ class ActorCritic(nn.Module):
     hidden: tuple[int, ...]
     action_dim: int
     init_std: float
+    fresh: str = "orthogonal"
     reads = ("obs",)  # its inputs
 
     def setup(self):
-        self.actor = MLP((*self.hidden, self.action_dim), gain=0.01)  # the first actions are ~0
-        self.critic = MLP((*self.hidden, 1), gain=0.05)
+        self.actor = MLP((*self.hidden, self.action_dim), 0.01, self.fresh)  # the first actions are ~0
+        self.critic = MLP((*self.hidden, 1), 0.05, self.fresh)
         self.log_std = self.param("log_std", nn.initializers.constant(jnp.log(self.init_std)), (self.action_dim,))
 
     def __call__(self, inputs):
@@ -245,10 +262,11 @@ class PIDMActorCritic(nn.Module):
     prop_dim: int
     action_dim: int
     init_std: float
+    fresh: str
     reads = ("obs", "prop", "action")
 
     def setup(self):
-        ends = {"goal": "intention_encoder", "goal_to_head": True}
+        ends = {"goal": "intention_encoder", "goal_to_head": True, "fresh": self.fresh}
         self.actor = PIDM(self.sizes, self.action_dim, head="action_synthesizer", gain=0.003, **ends)  # actions ~0
         self.critic = PIDM(self.sizes, 1, head="value_synthesizer", gain=0.05, **ends)
         self.log_std = self.param("log_std", nn.initializers.constant(jnp.log(self.init_std)), (self.action_dim,))
@@ -276,11 +294,11 @@ class PIDMActorCritic(nn.Module):
 def make_net(args, env):
     """The network that the arguments name, for this environment."""
     if args.network == "mlp":
-        return ActorCritic(args.hidden, env.action_dim, args.init_std)
+        return ActorCritic(args.hidden, env.action_dim, args.init_std, args.fresh)
     sizes = SIZES[env.robot.name]
     wide = args.intention or sizes.goal[:-1]  # perceptive tasks need more to see with
     sizes = dataclasses.replace(sizes, goal=(*wide, sizes.goal[-1]))
-    return PIDMActorCritic(sizes, env.prop_dim, env.action_dim, args.init_std)
+    return PIDMActorCritic(sizes, env.prop_dim, env.action_dim, args.init_std, args.fresh)
 
 
 # --- Warm start ---

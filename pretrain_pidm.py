@@ -95,17 +95,29 @@ SIZES = {
 }
 
 
+def dense(width, fan_in, gain, fresh):
+    """A linear layer: orthogonal weights times gain, no biases; or, as PyTorch does it, all within 1/sqrt(fan_in)."""
+
+    def pytorch(key, shape, dtype):
+        return jax.random.uniform(key, shape, dtype, -1.0, 1.0) / fan_in**0.5
+
+    if fresh == "pytorch":
+        return nn.Dense(width, kernel_init=pytorch, bias_init=pytorch)
+    return nn.Dense(width, kernel_init=nn.initializers.orthogonal(gain))
+
+
 class MLP(nn.Module):
     """Dense layers with ELU between them; the last one is linear, its weights scaled by `gain`."""
 
     widths: tuple[int, ...]
     gain: float = 2**0.5
+    fresh: str = "orthogonal"
 
     @nn.compact
     def __call__(self, x):
         for width in self.widths[:-1]:
-            x = nn.elu(nn.Dense(width, kernel_init=nn.initializers.orthogonal(2**0.5))(x))
-        return nn.Dense(self.widths[-1], kernel_init=nn.initializers.orthogonal(self.gain))(x)
+            x = nn.elu(dense(width, x.shape[-1], 2**0.5, self.fresh)(x))
+        return dense(self.widths[-1], x.shape[-1], self.gain, self.fresh)(x)
 
 
 class PIDM(nn.Module):
@@ -121,15 +133,17 @@ class PIDM(nn.Module):
     head: str = "prediction_decoder"
     goal_to_head: bool = False
     gain: float = 1.0  # of the last layer
+    fresh: str = "orthogonal"
 
     @nn.compact
     def __call__(self, history, goal):
         """history (..., (K+1) X + K A) and goal (..., G), both of order one -> (..., out_dim)."""
-        z_history = nn.elu(MLP(self.sizes.history, name="history_encoder")(history))
-        z_goal = nn.elu(MLP(self.sizes.goal, name=self.goal)(goal))
-        z = nn.elu(MLP(self.sizes.backbone, name="backbone")(jnp.concatenate([z_history, z_goal], -1)))
+        part = partial(MLP, fresh=self.fresh)
+        z_history = nn.elu(part(self.sizes.history, name="history_encoder")(history))
+        z_goal = nn.elu(part(self.sizes.goal, name=self.goal)(goal))
+        z = nn.elu(part(self.sizes.backbone, name="backbone")(jnp.concatenate([z_history, z_goal], -1)))
         z = jnp.concatenate([z, z_goal], -1) if self.goal_to_head else z
-        return MLP((*self.sizes.head, self.out_dim), self.gain, name=self.head)(z)
+        return part((*self.sizes.head, self.out_dim), self.gain, name=self.head)(z)
 
 
 def standardise(norm, name, x):

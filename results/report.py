@@ -49,6 +49,9 @@ METHODS = {
     "pidm_7k": "PIDM pretrained on 7 k",
     "pidm_70k": "PIDM pretrained on 70 k",
     "pidm_700k": "PIDM pretrained on 700 k",
+    "mlp_orthogonal": "MLP, orthogonal",
+    "pidm_random_orthogonal": "PIDM random, orthogonal",
+    "pidm_pretrained_orthogonal": "PIDM pretrained, orthogonal",
     "pidm_scaled": "PIDM pretrained, scaled",
     "pidm_slow": "PIDM pretrained, slow start",
 }
@@ -383,6 +386,7 @@ parkour: progress of the curriculum), iterations those to 90% of PIDM random's f
 Brackets are 95% bootstrap intervals over seeds; with few seeds they are rough, and with one there are none.
 """
 BEYOND = """`PIDM shuffled` has the pretrained weights permuted within each layer: the same scale, no knowledge.
+`orthogonal` has orthogonal first weights, our default, where the others have PyTorch's, as the paper.
 `scaled` halves the loaded backbone's output; `slow start` lets loaded parts move little in the first 50 iterations.
 """
 BEGIN, END = "<!-- results/report.py writes from here -->", "<!-- to here -->"
@@ -408,7 +412,7 @@ def page(study, updates):
         lines += ["Error over action magnitude on held-out transitions, by the number of those trained on.", ""]
         lines += ["![sizes](study/sizes.png)", ""]
     ran = set().union(*study.values())
-    beyond = {m: METHODS[m] for m in ("pidm_shuffled", "pidm_scaled", "pidm_slow") if m in ran}
+    beyond = {m: title for m, title in METHODS.items() if m in ran and m not in (*parts, *sizes, "mlp", "pidm_random")}
     if beyond:
         tasks = [task for task, runs in study.items() if beyond.keys() & runs.keys()]
         lines += ["## Controls, and what the paper does not have", ""]

@@ -7,7 +7,8 @@
 A run uses the cores it may. Two at once, each pinned to one of two cores (`taskset -c 0`), make 15 to 25% more steps.
 
 Without --tasks, --methods and --seeds it is the whole grid: Table I of the paper (nine tasks, three methods, five
-seeds), Table II (actor or critic alone), the sizes of the pretraining set, and a control with shuffled weights. A run
+seeds), Table II (actor or critic alone), the sizes of the pretraining set, a control with shuffled weights, and what
+orthogonal first weights, our default, change. A run
 is trained and evaluated in runs/study/<scale>/<task>/<method>/seed<k>; its small files are kept under results/study in
 the same folders, where report.py reads them. Scales never mix.
 """
@@ -32,24 +33,30 @@ from results import recording
 
 PIDM = "assets/pidm/{robot}.msgpack"
 SMALL = "results/pidm/{robot}/sizes/{size}.msgpack"  # made by pidm.py --stages sizes
+PAPER = ("--fresh", "pytorch")  # the paper's first weights (rsl_rl), of everything that is not loaded
 METHODS = {  # method -> arguments of ppo_finetune.py
-    "mlp": ("--network", "mlp"),
-    "pidm_random": ("--network", "pidm"),
-    "pidm_pretrained": ("--pretrained", PIDM),
-    "pidm_shuffled": ("--pretrained", PIDM, "--init", "shuffled"),
-    "pidm_actor": ("--pretrained", PIDM, "--init", "actor"),
-    "pidm_critic": ("--pretrained", PIDM, "--init", "critic"),
-    "pidm_7k": ("--pretrained", SMALL.replace("{size}", "7000")),
-    "pidm_70k": ("--pretrained", SMALL.replace("{size}", "70000")),
-    "pidm_700k": ("--pretrained", SMALL.replace("{size}", "700000")),
+    "mlp": ("--network", "mlp", *PAPER),
+    "pidm_random": ("--network", "pidm", *PAPER),
+    "pidm_pretrained": ("--pretrained", PIDM, *PAPER),
+    "pidm_shuffled": ("--pretrained", PIDM, "--init", "shuffled", *PAPER),
+    "pidm_actor": ("--pretrained", PIDM, "--init", "actor", *PAPER),
+    "pidm_critic": ("--pretrained", PIDM, "--init", "critic", *PAPER),
+    "pidm_7k": ("--pretrained", SMALL.replace("{size}", "7000"), *PAPER),
+    "pidm_70k": ("--pretrained", SMALL.replace("{size}", "70000"), *PAPER),
+    "pidm_700k": ("--pretrained", SMALL.replace("{size}", "700000"), *PAPER),
     # beyond the paper
-    "pidm_scaled": ("--pretrained", PIDM, "--core-scale", "0.5"),  # features as large as fresh ones
-    "pidm_slow": ("--pretrained", PIDM, "--warm-iterations", "50"),
+    "mlp_orthogonal": ("--network", "mlp"),
+    "pidm_random_orthogonal": ("--network", "pidm"),
+    "pidm_pretrained_orthogonal": ("--pretrained", PIDM),
+    "pidm_scaled": ("--pretrained", PIDM, "--core-scale", "0.5", *PAPER),  # features as large as fresh ones
+    "pidm_slow": ("--pretrained", PIDM, "--warm-iterations", "50", *PAPER),
 }
 TABLE_1 = ("mlp", "pidm_random", "pidm_pretrained")
+ORTHOGONAL = ("mlp_orthogonal", "pidm_random_orthogonal", "pidm_pretrained_orthogonal")
 ABLATIONS = ("pidm_actor", "pidm_critic", "pidm_7k", "pidm_70k", "pidm_700k")
 GRID = {  # task -> methods; blind tasks first
-    **dict.fromkeys(("go1_loco", "anymal_loco", "anymal_pedipulation", "g1_loco"), (*TABLE_1, "pidm_shuffled")),
+    **dict.fromkeys(("go1_loco", "anymal_loco"), (*TABLE_1, *ORTHOGONAL, "pidm_shuffled")),
+    **dict.fromkeys(("anymal_pedipulation", "g1_loco"), (*TABLE_1, "pidm_shuffled")),
     **dict.fromkeys(("anymal_climb_up", "anymal_climb_down"), (*TABLE_1, *ABLATIONS)),
     **dict.fromkeys(("anymal_crouch", "anymal_jump", "anymal_parkour_walk"), TABLE_1),
 }

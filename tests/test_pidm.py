@@ -253,12 +253,13 @@ def test_loaded_parts_start_slowly_and_scaled(pretrained, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["anymal_loco", "go1_loco", "g1_loco"])
-def test_first_actions_are_small_wherever_the_first_rollout_gets(name, jitted):
-    """A warm-started actor still commands (nearly) the default pose: |mean| < 0.02 (paper Sec. IV-E)."""
+@pytest.mark.parametrize(("fresh", "most"), [("orthogonal", 0.02), ("pytorch", 1.0)])
+def test_first_actions_are_small_wherever_the_first_rollout_gets(name, fresh, most, jitted):
+    """A warm-started actor still commands (nearly) the default pose (paper Sec. IV-E); the noise has a std of 1."""
     task = jitted(name)
     env, state = task.env, task.start(16)
     path = finetune.SHIPPED / f"{env.robot.name}.msgpack"
-    args = finetune.merge(finetune.Args(task=name, preset="smoke", pretrained=str(path)), env.config.ppo)
+    args = finetune.merge(finetune.Args(task=name, preset="smoke", pretrained=str(path), fresh=fresh), env.config.ppo)
     net = finetune.make_net(args, env)
     params = finetune.init_params(args, env, net, jax.random.key(0))
     largest = []
@@ -266,7 +267,28 @@ def test_first_actions_are_small_wherever_the_first_rollout_gets(name, jitted):
         inputs = finetune.net_inputs(net, state.obs, state.history)
         largest.append(float(jnp.abs(net.apply(params, inputs, method=net.mean)).max()))
         state = task.act(state, i, std=1.0)
-    assert 0 < max(largest) < 0.02
+    assert 0 < max(largest) < most
+
+
+@pytest.mark.parametrize("network", ["mlp", "pidm"])
+def test_first_weights_are_as_pytorch_makes_them(network, jitted):
+    """Every weight and bias fills the interval within 1/sqrt(inputs); without the flag matrices are orthogonal."""
+    env = jitted("go1_loco").env
+    for fresh in ("pytorch", "orthogonal"):
+        args = finetune.merge(finetune.Args(preset="smoke", network=network, fresh=fresh), env.config.ppo)
+        params = finetune.init_params(args, env, finetune.make_net(args, env), jax.random.key(0))["params"]
+        layers = jax.tree.leaves(params, is_leaf=lambda x: isinstance(x, dict) and "kernel" in x)
+        for layer in [x for x in layers if isinstance(x, dict)]:
+            kernel, bias = np.asarray(layer["kernel"]), np.asarray(layer["bias"])
+            if fresh == "pytorch":
+                bound = len(kernel) ** -0.5
+                assert 0.95 * bound < np.abs(kernel).max() <= bound and abs(kernel.std() * 3**0.5 / bound - 1) < 0.1
+                assert 0 < np.abs(bias).max() <= bound
+            else:
+                small = kernel if kernel.shape[0] < kernel.shape[1] else kernel.T
+                gram = small @ small.T
+                np.testing.assert_allclose(gram, np.eye(len(small)) * gram[0, 0], atol=1e-4)
+                assert not bias.any()
 
 
 @pytest.mark.parametrize("task", [task for task, (_, config) in envs.TASKS.items() if "intention" not in config.ppo])
