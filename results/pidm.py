@@ -38,7 +38,12 @@ EARLY = 100  # iterations of a task's training whose states the coverage figure 
 class Args:
     robots: tuple[str, ...] = ("go1", "anymal_d", "g1")
     preset: Literal["smoke", "cpu", "gpu"] = "cpu"
-    stages: tuple[Literal["collect", "pretrain", "look", "sizes"], ...] = ("collect", "pretrain", "look")
+    stages: tuple[Literal["collect", "pretrain", "look", "features", "sizes"], ...] = (
+        "collect",
+        "pretrain",
+        "look",
+        "features",
+    )
 
 
 def run(*words):
@@ -117,8 +122,15 @@ def walking_error(robot, task, num_envs=256, steps=200):
     return float(error.mean() / size.mean())
 
 
-def feature_size(task, **choice):
-    """Root mean square of the actor's backbone output over the first rollout of a task."""
+def effective_rank(x):
+    """How many directions x (S, F) fills: exp of the entropy of its covariance's spectrum (Roy and Vetterli 2007)."""
+    share = np.linalg.svd(x - x.mean(0), compute_uv=False) ** 2
+    share = share[share > 0] / share.sum()
+    return float(np.exp(-np.sum(share * np.log(share))))
+
+
+def first_features(task, **choice):
+    """The actor's backbone output over the first rollout of a task: root mean square and effective rank."""
     env = ppo_finetune.envs.make(task, "c")
     args = ppo_finetune.merge(ppo_finetune.Args(task=task, network="pidm", **choice), env.config.ppo)
     net = ppo_finetune.make_net(args, env)
@@ -130,14 +142,18 @@ def feature_size(task, **choice):
         _, seen = net.apply(state.params, roll.inputs, capture_intermediates=True, mutable=["intermediates"])
         return ppo_finetune.nn.elu(seen["intermediates"]["actor"]["backbone"]["__call__"][0])
 
-    return float(jnp.sqrt((features(state) ** 2).mean()))
+    z = np.asarray(features(state))
+    z = z.reshape(-1, z.shape[-1])
+    return {"root mean square": float(np.sqrt((z**2).mean())), "effective rank": effective_rank(z)}
 
 
-def feature_sizes(robot, task):
-    """`feature_size` of a fresh, a loaded and a shuffled core."""
+def compare_features(robot, task):
+    """`first_features` of a fresh, a loaded and a shuffled core."""
     loaded = {"pretrained": str(ROOT / f"assets/pidm/{robot}.msgpack")}
-    choices = {"fresh": {}, "loaded": loaded, "shuffled": loaded | {"init": "shuffled"}}
-    return {f"backbone features in {task}, {name}": feature_size(task, **one) for name, one in choices.items()}
+    choices = {"fresh, orthogonal": {}, "fresh, as PyTorch's": {"fresh": "pytorch"}}
+    choices |= {"loaded": loaded, "loaded and shuffled": loaded | {"init": "shuffled"}}
+    found = {name: first_features(task, **choice) for name, choice in choices.items()}
+    return {f"features in {task}, {what}, {name}": x for name, facts in found.items() for what, x in facts.items()}
 
 
 def occupied(env, x, bins=20):
@@ -217,7 +233,6 @@ def look(args, robot):
     coverage = {f"joint space, {name}": occupied(env, x) for name, x in kinds.items()}
     coverage |= novelty(env, pretrain_pidm.Dataset(ROOT / f"runs/explore/{robot}/seed0"), kept / "novelty.png")
     coverage[f"normalized_error, recorded policy of {task}"] = walking_error(robot, task)
-    coverage |= feature_sizes(robot, task)
     print(robot, records.line(coverage))
     records.replace_text(kept / "coverage.json", json.dumps(coverage, indent=1) + "\n")
     name, points = project([x[::5] for x in kinds.values()])
@@ -241,7 +256,8 @@ Made by `python results/pidm.py`, which runs, for each robot,
 Errors are on held-out environments, with the tasks' sensor noise. Joint space is the share of a 20 x 20 grid over each
 pair of neighbouring joints of a limb that 20,000 samples visit. Disagreement is that of an ensemble trained on the
 first tenth of the collection, there and on the last tenth. The recorded policy is that of results/tasks, with its
-noise: how well the PIDM knows a gait that it never saw. Backbone features are root mean squares over the first rollout.
+noise: how well the PIDM knows a gait that it never saw. Features are the outputs of the actor's backbone over the first
+rollout of a task; their effective rank (Roy and Vetterli 2007) is the number of directions, of 64, that they fill.
 
 """
 
@@ -251,8 +267,8 @@ def write_readme():
     lines = []
     for folder in sorted(path for path in (ROOT / "results/pidm").iterdir() if path.is_dir()):
         meta, result = (json.loads((folder / name).read_text()) for name in ("explore/meta.json", "validation.json"))
-        coverage = folder / "coverage.json"
-        result |= json.loads(coverage.read_text()) if coverage.exists() else {}
+        for extra in (folder / "coverage.json", folder / "features.json"):
+            result |= json.loads(extra.read_text()) if extra.exists() else {}
         lines += [f"## {folder.name}", "", f"{meta['transitions']:,} transitions.", ""]
         lines += [
             "| what | figure |",
@@ -276,6 +292,9 @@ def main(args):
             keep(robot)
         if "look" in args.stages:
             look(args, robot)
+        if "features" in args.stages:
+            found = compare_features(robot, robot.removesuffix("_d") + "_loco")
+            records.replace_text(ROOT / f"results/pidm/{robot}/features.json", json.dumps(found, indent=1) + "\n")
         if "sizes" in args.stages:
             pretrain_on_parts(args, robot)
     write_readme()
