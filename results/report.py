@@ -212,15 +212,15 @@ def seeds(runs, methods):
     return str(counts[0]) if len(set(counts)) == 1 else " / ".join(map(str, counts))
 
 
-def table_1(study):
+def table_1(study, tasks=tuple(TASKS)):
     """Paper Table I: final performance and iterations to converge of MLP and pretrained PIDM, against PIDM random."""
     methods = {"mlp": "MLP", "pidm_pretrained": "pretrained"}
     names = {"final": "final", "to 90%": "iterations"}
     columns = [(f"{title}: {label} [%]", m, n) for n, title in names.items() for m, label in methods.items()]
     rows = []
-    for task, title in TASKS.items():
+    for task in tasks:
         runs = study.get(task, {})
-        row = {"task": title, "seeds": seeds(runs, ("mlp", "pidm_random", "pidm_pretrained"))}
+        row = {"task": TASKS[task], "seeds": seeds(runs, ("mlp", "pidm_random", "pidm_pretrained"))}
         for i, (head, method, name) in enumerate(columns):
             row |= {head: cell(runs, method, name), "paper" + " " * i: paper(method, name, task)}
         rows.append(row)
@@ -302,6 +302,12 @@ def save(plt, fig, path):
     plt.close(fig)
 
 
+def style(method):
+    """Colour and line of a method: the same in every panel, dashed where only its first weights differ."""
+    base = method.removesuffix("_orthogonal")
+    return {"color": f"C{list(METHODS).index(base) % 10}", "linestyle": "-" if base == method else "--"}
+
+
 def draw_curves(study, path, extra=None):
     """Mean and std of the indicator over iterations, a panel a task; `extra` (label, iteration, value) goes on top."""
     plt, fig, axes = panels(len(study))
@@ -309,8 +315,8 @@ def draw_curves(study, path, extra=None):
         for method, mine in runs.items():
             values = np.stack([run["indicator"] for run in mine])
             iteration, mean, std = mine[0]["iteration"], values.mean(0), values.std(0)
-            (line,) = ax.plot(iteration, mean, label=f"{METHODS[method]} ({len(mine)})")
-            ax.fill_between(iteration, mean - std, mean + std, alpha=0.15, color=line.get_color())
+            ax.plot(iteration, mean, label=f"{METHODS[method]} ({len(mine)})", **style(method))
+            ax.fill_between(iteration, mean - std, mean + std, alpha=0.15, color=style(method)["color"], linewidth=0)
         if extra:
             ax.plot(*extra[1:], color="black", label=extra[0])
         parkour = "progress" in next(iter(runs.values()))[0]["columns"]
@@ -429,9 +435,13 @@ def page(study, updates):
 
 
 def with_table(text, study):
-    """The project's README with Table I between the marks."""
+    """The project's README with the rows of Table I that were run between the marks."""
+    ran = [task for task in TASKS if "pidm_random" in study.get(task, {})]
+    missing = ", ".join(f"`{task}`" for task in TASKS if task not in ran)
+    lines = ["", *table_1(study, ran), ""] if ran else [""]
+    lines += [f"Not run yet: {missing}.", ""] if missing else []
     before, rest = text.split(BEGIN)
-    return "\n".join([before + BEGIN, "", *table_1(study), "", END + rest.split(END)[1]])
+    return "\n".join([before + BEGIN, *lines, END + rest.split(END)[1]])
 
 
 def beside(folder):
