@@ -56,6 +56,7 @@ class Args:
     # --- Exploration ---
     policy: Literal["explore", "random"] = "explore"  # random: the fresh policy throughout, for comparison
     disagreement_coef: float = 2.0  # reward per second of the mean disagreement: more than the regularisers take
+    calm: float = 1.0  # beyond the paper: episodes scale all actions by a number of their own between this and 1
     members: int = 5  # M
     buffer_rollouts: int = 8  # R = N * T * buffer_rollouts
     ensemble_steps: int = 8  # gradient steps per iteration
@@ -108,6 +109,8 @@ def merge(args, ppo):
         raise records.UserError(
             f"--validation {args.validation} of {args.num_envs} environments leaves training or validation empty"
         )
+    if not 0 < args.calm <= 1:
+        raise records.UserError(f"--calm must be above 0 and at most 1, not {args.calm}")
     records.check_minibatches(args)
     return args
 
@@ -381,7 +384,8 @@ def collect(args, env, net, params, env_state, key):
         done = env_state.terminated | env_state.truncated
         roll = Rollout(inputs, action, mean, log_prob(mean, log_std, action), value, env_state.reward, bootstrap, done)
         delta = env_state.final_history["prop"][:, -1] - before.history["prop"][:, -1]
-        seen = Transitions(before.history["prop"], before.history["action"], delta, action)
+        executed = jax.vmap(env.executed)(before, action)
+        seen = Transitions(before.history["prop"], before.history["action"], delta, executed)
         extra = {"lin_vel": jax.vmap(env.motion)(before.physics).lin_vel, "rough": env.on_rough(before.physics)}
         return env_state, (roll, seen, extra, step_metrics(env_state, done))
 
@@ -552,7 +556,7 @@ def iteration(args, env, net, opt, member, member_opt, state):
     ensemble, loss = retrain(args, member, member_opt, ensemble, buffer, filled, keys[2])
 
     ended = jnp.concatenate([state.first[None], roll.done])
-    data = extra | {"x": seen.prop[:, :, -1], "action": roll.action, "first": ended[:-1]}
+    data = extra | {"x": seen.prop[:, :, -1], "action": seen.action, "first": ended[:-1]}
     metrics = {k: v.sum() if k.startswith("sum/") else v.mean() for k, v in metrics.items()} | losses | judged
     metrics |= {"ensemble_nll": loss, "action_std": jnp.exp(params["params"]["log_std"]).mean()}
     state = TrainState(params, opt_state, lr, env_state, ended[-1], ensemble, buffer, state.iteration + 1)
@@ -666,7 +670,7 @@ SHOWN = ("disagreement", "ensemble_error", "fall_rate", "kl", "action_std")  # i
 def make_env(args):
     """The robot's exploration environment, or a UserError that lists the right names."""
     try:
-        env = envs.make_explore(args.robot, args.engine)
+        env = envs.make_explore(args.robot, args.engine, calm=args.calm)
         devices.check_engine(env.engine)
         return env
     except (ValueError, ImportError) as error:

@@ -6,6 +6,7 @@ has. Every episode starts on the plane or on rough ground, with its own masses a
 
 from dataclasses import dataclass
 
+import flax
 import jax
 import jax.numpy as jnp
 
@@ -24,6 +25,14 @@ class ExploreConfig(Config):
     hasty: float = 0.2  # [s] flights shorter than this are punished
     perturb_force: float = 0.0  # [N] half-width of each component of a force on the base
     perturb_seconds: float = 2.0  # mean time between its changes; half the draws are zero
+    calm: float = 1.0  # every episode multiplies all actions by a number of its own between this and 1
+
+
+@flax.struct.dataclass
+class Task(FootClocks):
+    """State of exploration."""
+
+    vigour: jax.Array  # () what the policy's actions are multiplied by in this episode
 
 
 class Explore(Env):
@@ -63,9 +72,16 @@ class Explore(Env):
         wrench = physics.wrench.at[1, :3].set(jnp.where(changes, force, physics.wrench[1, :3]))
         return physics.replace(wrench=wrench), push_at
 
+    def executed(self, state, action):
+        """What the robot does when the policy says `action` (A,)."""
+        return state.task.vigour * action
+
+    def step(self, state, action):
+        return super().step(state, self.executed(state, action))
+
     def init_task(self, key, physics, course):
         feet = jnp.zeros(len(self.robot.feet))
-        return FootClocks(feet, feet, feet)
+        return Task(feet, feet, feet, vigour=uniform(key, self.config.calm, 1.0))
 
     def track(self, task, motion):
         return task.tick(motion.foot_contact, self.dt)

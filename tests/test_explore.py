@@ -47,6 +47,20 @@ def test_rough_ground_is_what_a_ray_meets(go1):
     assert want.max() > 0.05 and want.min() == 0.0
 
 
+def test_calm_episodes_do_less_and_say_so():
+    """Actions shrink by each episode's own factor; history and observation hold what was done, not what was said."""
+    env = envs.make_explore("go1", "c", calm=0.2)
+    state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), 400))
+    factor = np.asarray(state.task.vigour)
+    assert factor.min() < 0.23 and factor.max() > 0.97 and abs(factor.mean() - 0.6) < 0.05
+    said = jax.random.normal(jax.random.key(1), (400, 12))
+    after = jax.jit(jax.vmap(env.step))(state, said)
+    done = np.asarray(after.terminated | after.truncated)
+    np.testing.assert_allclose(after.history["action"][~done, -1], (factor[:, None] * said)[~done], rtol=1e-6)
+    plain = envs.make_explore("go1", "c")
+    assert float(plain.executed(plain.reset(jax.random.key(0)), jnp.ones(12))[0]) == 1.0
+
+
 @pytest.mark.parametrize("robot", envs.EXPLORE)
 def test_robots_start_on_the_ground(robot):
     """Some episodes start on the plane and some on rough ground; feet are on it, not in it, and masses differ."""
@@ -240,6 +254,7 @@ def test_stages_one_to_three_through_files(collected, tmp_path):
         ({"robot": "spot"}, ["unknown robot 'spot'", "go1"]),
         ({"num_envs": 1}, ["--validation 0.08 of 1 environments"]),
         ({"validation": 0.0}, ["--validation 0.0"]),
+        ({"calm": 0.0}, ["--calm must be above 0"]),
         ({"members": 0}, ["--members must be at least 1"]),
         ({"num_minibatches": 5}, ["5 minibatches do not divide"]),
     ],
