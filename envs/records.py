@@ -188,9 +188,10 @@ def load_state(folder, like):
     wanted, structure = jax.tree.flatten(like)
     try:
         content = flax.serialization.msgpack_restore(path.read_bytes())
-        leaves, rows = [content["leaves"][str(i)] for i in range(len(wanted))], json.loads(content["rows"])
-        leaves = [jax.random.wrap_key_data(x) if is_key(w) else x for x, w in zip(leaves, wanted, strict=True)]
-        same = all(x.shape == w.shape and x.dtype == w.dtype for x, w in zip(leaves, wanted, strict=True))
+        leaves, rows = [content["leaves"][str(i)] for i in range(len(content["leaves"]))], json.loads(content["rows"])
+        same = len(leaves) == len(wanted)
+        leaves = [jax.random.wrap_key_data(x) if is_key(w) else x for x, w in zip(leaves, wanted, strict=False)]
+        same &= all(x.shape == w.shape and x.dtype == w.dtype for x, w in zip(leaves, wanted, strict=False))
     except OSError as error:
         raise UserError(f"cannot resume from {path}: {error.strerror}") from None
     except Exception:  # msgpack has no common error class; whatever it says, the file is not ours

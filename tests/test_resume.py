@@ -133,6 +133,12 @@ def test_what_cannot_be_resumed_is_refused(whole, tmp_path, refused):
     (out / records.STATE).write_bytes(state)
     (out / "args.json").write_text(json.dumps(record | {"num_envs": 8}))
     check("other code or settings")
+    content = flax.serialization.msgpack_restore(state)
+    content["leaves"].pop(str(len(content["leaves"]) - 1))
+    (out / "args.json").write_text(json.dumps(record))
+    (out / records.STATE).write_bytes(flax.serialization.msgpack_serialize(content))
+    check("other code or settings")
+    (out / records.STATE).write_bytes(state)
     (out / "args.json").write_text("{")
     check("args.json is damaged")
     assert (out / records.STATE).read_bytes() == state
