@@ -246,7 +246,8 @@ def ablation(study, methods, tasks):
                 row[f"{TASKS[task]}: {what} [%]"] = cell(runs, method, name)
                 row["paper" + " " * (2 * i + j)] = paper(method, name, task)
         rows.append(row)
-    return markdown(rows)
+    empty = [column for column in rows[0] if not any(row[column] for row in rows)]  # the paper has no such runs
+    return markdown([{column: text for column, text in row.items() if column not in empty} for row in rows])
 
 
 def details(runs):
@@ -419,8 +420,8 @@ def page(study, updates):
         lines += ["![sizes](study/sizes.png)", ""]
     ran = set().union(*study.values())
     beyond = {m: title for m, title in METHODS.items() if m in ran and m not in (*parts, *sizes, "mlp", "pidm_random")}
-    if beyond:
-        tasks = [task for task, runs in study.items() if beyond.keys() & runs.keys()]
+    if beyond and any("pidm_random" in runs for runs in study.values()):
+        tasks = [task for task, runs in study.items() if beyond.keys() & runs.keys() and "pidm_random" in runs]
         lines += ["## Controls, and what the paper does not have", ""]
         lines += [BEYOND, *ablation(study, beyond, tasks), ""]
     if updates:
