@@ -9,7 +9,7 @@ engines   steps per second of the physics alone ("bare": random joint targets, a
 training  ppo_finetune.py with a task's preset, learning included, after compilation
 seeds     five seeds in one program against one seed
 solver    how far a limit on the contact solver's iterations moves a control step of an exploring robot
-peers     PPO of rsl_rl and Brax; see peers.py
+peers     PPO of rsl_rl and Brax, and how many times faster ours is ("ours": at the same widths); see peers.py
 
 A part that is measured again replaces what stood there. Every figure comes from a process of its own.
 """
@@ -252,6 +252,17 @@ def table(rows):
     return "\n".join(lines)
 
 
+def with_ratios(rows):
+    """Rows of part peers, and how many times faster ours is: at the same widths, and at the first ones measured."""
+    ours = {tuple(row["hidden"]): row["steps/s"] for row in rows if row["what"] == "ours" and "steps/s" in row}
+    told = []
+    for row in rows:
+        speed, same = row.get("steps/s"), ours.get(tuple(row["hidden"]))
+        known = speed and same
+        told.append(row | ({"ours": same / speed, "ours, small": next(iter(ours.values())) / speed} if known else {}))
+    return told
+
+
 def main(args):
     if args.cell:
         what, *inputs = json.loads(args.cell)
@@ -272,6 +283,8 @@ def main(args):
         for row in ROWS[part](args):
             rows.append(row)
             print("  ".join(f"{name} {as_text(value)}" for name, value in row.items()), flush=True)
+        if part == "peers":
+            print(table(with_ratios(rows)))
         known[f"{part} {args.label}".strip()] = {"machine": here, "rows": rows}
         out.mkdir(parents=True, exist_ok=True)
         path.write_text(json.dumps(known, indent=1) + "\n")
@@ -284,7 +297,8 @@ def write_page(out):
     for path in sorted(out.glob("*.json")):
         for part, found in json.loads(path.read_text()).items():
             facts = ", ".join(f"{name} {value}" for name, value in found["machine"].items())
-            page += ["", f"## {path.stem}: {part}", "", f"{facts}.", "", table(found["rows"])]
+            rows = with_ratios(found["rows"]) if part.startswith("peers") else found["rows"]
+            page += ["", f"## {path.stem}: {part}", "", f"{facts}.", "", table(rows)]
     (out / "README.md").write_text("\n".join(page) + "\n")
 
 

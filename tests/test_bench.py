@@ -25,6 +25,13 @@ def test_page_has_every_row(tmp_path):
     assert "| go1_loco | 4 | 12,346 |  |" in lines and "| g1_loco |  |  | did not end in 1 s |" in lines
 
 
+def test_ratios():
+    speeds = (("ours", 1, 100.0), ("a", 1, 50.0), ("ours", 2, 60.0), ("b", 2, 20.0), ("c", 2, None))
+    rows = [{"what": what, "hidden": [width]} | ({"steps/s": v} if v else {}) for what, width, v in speeds]
+    ratios = [(row.get("ours"), row.get("ours, small")) for row in bench.with_ratios(rows)]
+    assert ratios == [(1.0, 1.0), (2.0, 2.0), (1.0, 100 / 60), (3.0, 5.0), (None, None)]
+
+
 @pytest.mark.parametrize(
     ("changes", "words"),
     [({"tasks": ("go2_loco",)}, ["unknown task 'go2_loco'"]), ({"parts": ("peers",)}, ["--peers PYTHON", "peers.py"])],
