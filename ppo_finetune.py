@@ -827,6 +827,7 @@ def export_onnx(args):
         "versions": records.versions(),
     }
     onnx.helper.set_model_props(model, {name: json.dumps(value) for name, value in facts.items()})
+    Path(args.export).parent.mkdir(parents=True, exist_ok=True)
     records.replace_bytes(Path(args.export), model.SerializeToString())
     print(f"wrote {args.export}")
 

@@ -55,13 +55,13 @@ def check_video(path):
         raise ValueError(f"{path} must end in .gif or .mp4")
     if path.suffix == ".mp4" and not shutil.which("ffmpeg"):
         raise ValueError("an MP4 needs the program ffmpeg; install it, or name a .gif")
-    if not path.parent.is_dir():
-        raise ValueError(f"there is no folder {path.parent}")
 
 
 def video(env, qpos, course, path):
     """Write a rollout qpos (steps, nq) on a course as a GIF or MP4, as its name ends; see check_video."""
-    images = draw(build(env, course), np.asarray(qpos[::EVERY], np.float64), size=(480, 360))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    size = (WIDTH, HEIGHT) if path.suffix == ".gif" else (2 * WIDTH, 2 * HEIGHT)  # a GIF grows large
+    images = draw(build(env, course), np.asarray(qpos[::EVERY], np.float64), size)
     if path.suffix == ".gif":
         return save_gif(images, env.dt, path)
     width, height = images[0].size

@@ -39,7 +39,7 @@ def workplace(tmp_path_factory):
     folder = tmp_path_factory.mktemp("readme")
     (folder / "assets").symlink_to(ROOT / "assets")
     shutil.copytree(ROOT / "results/tasks/go1_loco", folder / "results/tasks/go1_loco")
-    shutil.copytree(ROOT / "results/tasks/go1_loco", folder / "runs/demo")
+    shutil.copytree(ROOT / "results/tasks/go1_loco", folder / "runs/demo")  # as after make demo
     return folder
 
 
