@@ -68,7 +68,7 @@ class Args:
     hidden: tuple[int, ...] | None = None  # widths of the MLP's hidden layers
     intention: tuple[int, ...] | None = None  # of the PIDM's intention encoder but the last; None: as in pretraining
     init_std: float | None = None  # initial action std, in action units
-    # Deviation: the paper's fresh layers are as PyTorch makes them; orthogonal ones learn faster, see README.
+    # Deviation: rsl_rl's fresh layers are as PyTorch makes them; with orthogonal ones Go1 learns faster, see README.
     fresh: Literal["orthogonal", "pytorch"] = "orthogonal"  # first weights of all that is not loaded
     # --- Warm start, beyond the paper ---
     core_scale: float = 1.0  # multiplies the last layer of a loaded backbone, whose features are larger than fresh ones

@@ -303,7 +303,7 @@ def save(plt, fig, path):
     plt.close(fig)
 
 
-def style(method):
+def look_of(method):
     """Colour and line of a method: the same in every panel, dashed where only its first weights differ."""
     base = method.removesuffix("_orthogonal")
     return {"color": f"C{list(METHODS).index(base) % 10}", "linestyle": "-" if base == method else "--"}
@@ -316,8 +316,8 @@ def draw_curves(study, path, extra=None):
         for method, mine in runs.items():
             values = np.stack([run["indicator"] for run in mine])
             iteration, mean, std = mine[0]["iteration"], values.mean(0), values.std(0)
-            ax.plot(iteration, mean, label=f"{METHODS[method]} ({len(mine)})", **style(method))
-            ax.fill_between(iteration, mean - std, mean + std, alpha=0.15, color=style(method)["color"], linewidth=0)
+            ax.plot(iteration, mean, label=f"{METHODS[method]} ({len(mine)})", **look_of(method))
+            ax.fill_between(iteration, mean - std, mean + std, alpha=0.15, color=look_of(method)["color"], linewidth=0)
         if extra:
             ax.plot(*extra[1:], color="black", label=extra[0])
         parkour = "progress" in next(iter(runs.values()))[0]["columns"]
@@ -364,7 +364,7 @@ def draw_sizes(study, path, robot="anymal_d"):
     errors = sizes_of(robot)
     if len(errors) < 2:
         return False
-    methods = dict(zip(errors, ("pidm_7k", "pidm_70k", "pidm_700k", "pidm_pretrained"), strict=False))
+    methods = {7_000: "pidm_7k", 70_000: "pidm_70k", 700_000: "pidm_700k", max(errors): "pidm_pretrained"}
     plt, fig, (left, right) = panels(2)
     left.semilogx(list(errors), list(errors.values()), "o-")
     left.set(xlabel="transitions", ylabel="error over action magnitude")
@@ -383,6 +383,14 @@ def draw_sizes(study, path, robot="anymal_d"):
     return True
 
 
+def draw_all(study):
+    """Every figure that the runs allow; one that they no longer allow is removed."""
+    draw_curves(study, STUDY / "curves.png")
+    for draw, name in ((draw_updates, "updates.png"), (draw_sizes, "sizes.png")):
+        if not draw(study, STUDY / name):
+            (STUDY / name).unlink(missing_ok=True)
+
+
 # --- Pages ---
 
 HEAD = """# Results
@@ -393,7 +401,8 @@ parkour: progress of the curriculum), iterations those to 90% of PIDM random's f
 Brackets are 95% bootstrap intervals over seeds; with few seeds they are rough, and with one there are none.
 """
 BEYOND = """`PIDM shuffled` has the pretrained weights permuted within each layer: the same scale, no knowledge.
-`orthogonal` has orthogonal first weights, our default, where the others have PyTorch's, as the paper.
+`orthogonal` has orthogonal first weights, our default, where the others have PyTorch's, as rsl_rl, a fork
+of which the paper used.
 `scaled` halves the loaded backbone's output; `slow start` lets loaded parts move little in the first 50 iterations.
 """
 BEGIN, END = "<!-- results/report.py writes from here -->", "<!-- to here -->"
@@ -506,9 +515,7 @@ def main(args):
         return None
     for path, text in pages.items():
         records.replace_text(path, text)
-    draw_curves(study, STUDY / "curves.png")
-    draw_updates(study, STUDY / "updates.png")
-    draw_sizes(study, STUDY / "sizes.png")
+    draw_all(study)
     print("\n".join(table_1(study)))
     return None
 

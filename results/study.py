@@ -8,9 +8,9 @@ A run uses the cores it may. Two at once, each pinned to one of two cores (`task
 
 Without --tasks, --methods and --seeds it is the whole grid: Table I of the paper (nine tasks, three methods, five
 seeds), Table II (actor or critic alone), the sizes of the pretraining set, a control with shuffled weights, and what
-orthogonal first weights, our default, change. A run
-is trained and evaluated in runs/study/<scale>/<task>/<method>/seed<k>; its small files are kept under results/study in
-the same folders, where report.py reads them. Scales never mix.
+orthogonal first weights, our default, change. A run is trained and evaluated in
+runs/study/<scale>/<task>/<method>/seed<k>; its small files are kept under results/study in the same folders, where
+report.py reads them. Scales never mix.
 """
 
 import csv
@@ -33,7 +33,7 @@ from results import recording
 
 PIDM = "assets/pidm/{robot}.msgpack"
 SMALL = "results/pidm/{robot}/sizes/{size}.msgpack"  # made by pidm.py --stages sizes
-PAPER = ("--fresh", "pytorch")  # the paper's first weights (rsl_rl), of everything that is not loaded
+PAPER = ("--fresh", "pytorch")  # first weights of what is not loaded: rsl_rl's, a fork of which the paper used
 METHODS = {  # method -> arguments of ppo_finetune.py
     "mlp": ("--network", "mlp", *PAPER),
     "pidm_random": ("--network", "pidm", *PAPER),
@@ -48,7 +48,7 @@ METHODS = {  # method -> arguments of ppo_finetune.py
     "mlp_orthogonal": ("--network", "mlp"),
     "pidm_random_orthogonal": ("--network", "pidm"),
     "pidm_pretrained_orthogonal": ("--pretrained", PIDM),
-    "pidm_scaled": ("--pretrained", PIDM, "--core-scale", "0.5", *PAPER),  # features as large as fresh ones
+    "pidm_scaled": ("--pretrained", PIDM, "--core-scale", "0.5", *PAPER),
     "pidm_slow": ("--pretrained", PIDM, "--warm-iterations", "50", *PAPER),
 }
 TABLE_1 = ("mlp", "pidm_random", "pidm_pretrained")
