@@ -71,6 +71,7 @@ class Args:
     # Deviation: rsl_rl's fresh layers are as PyTorch makes them; with orthogonal ones Go1 learns faster, see README.
     fresh: Literal["orthogonal", "pytorch"] = "orthogonal"  # first weights of all that is not loaded
     # --- Warm start, beyond the paper ---
+    core: tuple[Literal["history_encoder", "backbone"], ...] = ("history_encoder", "backbone")  # parts that are loaded
     core_scale: float = 1.0  # multiplies the last layer of a loaded backbone, whose features are larger than fresh ones
     warm_iterations: int = 0  # iterations in which the step size of loaded parts grows from 0
     # --- PPO (rsl_rl) ---
@@ -117,6 +118,8 @@ def merge(args, ppo):
         raise records.UserError("--pretrained loads a PIDM; leave out --network mlp")
     if args.init != "both" and not args.pretrained:
         raise records.UserError(f"--init {args.init} needs --pretrained CHECKPOINT")
+    if args.core != CORE and not args.pretrained:
+        raise records.UserError("--core chooses what is loaded from a checkpoint; name one with --pretrained")
     values = {"hidden": ppo["hidden"], "init_std": ppo["init_std"], "entropy_coef": ppo["entropy"]}
     values |= {"intention": ppo.get("intention")} | PRESETS[args.preset] | ppo.get(args.preset, {})
     folder = f"runs/{args.task}/{method_name(args)}"
@@ -329,7 +332,7 @@ def loaded_branches(args):
 
 
 def warm_start(args, params, weights):
-    """Copy the PIDM's history_encoder and backbone into actor and critic, or into the one that args.init names."""
+    """Copy the PIDM's history_encoder and backbone, or args.core of them, into the branches that args.init names."""
     params = jax.tree.map(lambda x: x, params)  # new dicts, so that the caller's stay as they are
     if args.init == "shuffled":
         weights = shuffle(weights, jax.random.fold_in(jax.random.key(args.seed), 1))
@@ -338,7 +341,7 @@ def warm_start(args, params, weights):
     last = max(layers)  # Dense_0, Dense_1, ...
     weights |= {"backbone": layers | {last: jax.tree.map(lambda x: args.core_scale * x, layers[last])}}
     for branch in loaded_branches(args):
-        params["params"][branch] |= weights
+        params["params"][branch] |= {name: weights[name] for name in args.core}
     return params
 
 
@@ -350,7 +353,7 @@ def make_optimizer(args):
 
     def loaded(params):
         branches = loaded_branches(args)
-        return jax.tree_util.tree_map_with_path(lambda p, _: p[1].key in branches and p[2].key in CORE, params)
+        return jax.tree_util.tree_map_with_path(lambda p, _: p[1].key in branches and p[2].key in args.core, params)
 
     slow = optax.scale_by_schedule(optax.linear_schedule(0.0, 1.0, steps))
     return optax.chain(optax.scale_by_adam(), optax.masked(slow, loaded))
@@ -384,7 +387,7 @@ def describe(args, params):
     for branch in ("actor", "critic"):
         for name, part in params["params"][branch].items():
             shapes = [layer["kernel"].shape for layer in part.values()]
-            loaded = branch in loaded_branches(args) and name in CORE
+            loaded = branch in loaded_branches(args) and name in args.core
             widths = "-".join(str(width) for width in (shapes[0][0], *(shape[1] for shape in shapes)))
             print(f"  {branch:6} {name:18} {'loaded' if loaded else 'fresh ':6}  {widths}")
 

@@ -52,6 +52,7 @@ METHODS = {
     "mlp_orthogonal": "MLP, orthogonal",
     "pidm_random_orthogonal": "PIDM random, orthogonal",
     "pidm_pretrained_orthogonal": "PIDM pretrained, orthogonal",
+    "pidm_history_orthogonal": "PIDM pretrained, history encoder only, orthogonal",
     "pidm_scaled": "PIDM pretrained, scaled",
     "pidm_slow": "PIDM pretrained, slow start",
 }
@@ -305,8 +306,9 @@ def save(plt, fig, path):
 
 def look_of(method):
     """Colour and line of a method: the same in every panel, dashed where only its first weights differ."""
+    bases = list(dict.fromkeys(name.removesuffix("_orthogonal") for name in METHODS))
     base = method.removesuffix("_orthogonal")
-    return {"color": f"C{list(METHODS).index(base) % 10}", "linestyle": "-" if base == method else "--"}
+    return {"color": f"C{bases.index(base) % 10}", "linestyle": "-" if base == method else "--"}
 
 
 def draw_curves(study, path, extra=None):
@@ -403,7 +405,8 @@ Brackets are 95% bootstrap intervals over seeds; with few seeds they are rough, 
 BEYOND = """`PIDM shuffled` has the pretrained weights permuted within each layer: the same scale, no knowledge.
 `orthogonal` has orthogonal first weights, our default, where the others have PyTorch's, as rsl_rl, a fork
 of which the paper used.
-`scaled` halves the loaded backbone's output; `slow start` lets loaded parts move little in the first 50 iterations.
+`history encoder only` leaves the backbone fresh; `scaled` halves the loaded backbone's output; `slow start` lets
+loaded parts move little in the first 50 iterations.
 """
 BEGIN, END = "<!-- results/report.py writes from here -->", "<!-- to here -->"
 

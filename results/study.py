@@ -48,11 +48,12 @@ METHODS = {  # method -> arguments of ppo_finetune.py
     "mlp_orthogonal": ("--network", "mlp"),
     "pidm_random_orthogonal": ("--network", "pidm"),
     "pidm_pretrained_orthogonal": ("--pretrained", PIDM),
+    "pidm_history_orthogonal": ("--pretrained", PIDM, "--core", "history_encoder"),
     "pidm_scaled": ("--pretrained", PIDM, "--core-scale", "0.5", *PAPER),
     "pidm_slow": ("--pretrained", PIDM, "--warm-iterations", "50", *PAPER),
 }
 TABLE_1 = ("mlp", "pidm_random", "pidm_pretrained")
-ORTHOGONAL = ("mlp_orthogonal", "pidm_random_orthogonal", "pidm_pretrained_orthogonal")
+ORTHOGONAL = ("mlp_orthogonal", "pidm_random_orthogonal", "pidm_pretrained_orthogonal", "pidm_history_orthogonal")
 ABLATIONS = ("pidm_actor", "pidm_critic", "pidm_7k", "pidm_70k", "pidm_700k")
 GRID = {  # task -> methods; blind tasks first
     **dict.fromkeys(("go1_loco", "anymal_loco"), (*TABLE_1, *ORTHOGONAL, "pidm_shuffled")),

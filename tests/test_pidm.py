@@ -204,23 +204,25 @@ def test_wanted_change_over_several_steps(folder):
 # --- warm start ---
 
 
-def fresh_and_warm(path, init):
+def fresh_and_warm(path, init, core=finetune.CORE):
     """Parameters of a random and of a warm-started PIDM actor-critic of the same seed, and the checkpoint."""
     env = envs.make("go1_loco", "c")
     args = finetune.merge(
-        finetune.Args(preset="smoke", network="pidm", pretrained=str(path), init=init), env.config.ppo
+        finetune.Args(preset="smoke", network="pidm", pretrained=str(path), init=init, core=core), env.config.ppo
     )
     net = finetune.make_net(args, env)
     warm = finetune.init_params(args, env, net, jax.random.key(0))
     return net.init(jax.random.key(0), finetune.zero_inputs(env, net)), warm, finetune.load_pidm(path, env)
 
 
-@pytest.mark.parametrize("init", ["both", "actor", "critic"])
-def test_warm_start_copies_the_named_parts_and_no_others(pretrained, init):
-    fresh, warm, pidm = fresh_and_warm(pretrained / "pidm.msgpack", init)
+@pytest.mark.parametrize(
+    ("init", "core"), [*((init, finetune.CORE) for init in ("both", "actor", "critic")), ("both", ("history_encoder",))]
+)
+def test_warm_start_copies_the_named_parts_and_no_others(pretrained, init, core):
+    fresh, warm, pidm = fresh_and_warm(pretrained / "pidm.msgpack", init, core)
     for branch in ("actor", "critic"):
         for name, part in warm["params"][branch].items():
-            loaded = name in ("history_encoder", "backbone") and init in ("both", branch)
+            loaded = name in core and init in ("both", branch)
             want = pidm["params"][name] if loaded else fresh["params"][branch][name]
             jax.tree.map(np.testing.assert_array_equal, part, want)
     for name in ("prop_mean", "prop_std", "action_mean", "action_std"):
@@ -410,3 +412,4 @@ def test_batches_are_all_of_the_index_in_order(dataset):
 
 def test_init_without_pretrained_is_refused(refused):
     refused(finetune.main, finetune.Args(preset="smoke", init="shuffled"), "--init shuffled needs --pretrained")
+    refused(finetune.main, finetune.Args(preset="smoke", core=("backbone",)), "--core chooses what is loaded")
