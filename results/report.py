@@ -28,6 +28,7 @@ sys.path.insert(0, str(ROOT))
 from envs import records
 
 STUDY = ROOT / "results/study"
+DISCUSSION = ROOT / "results/discussion.md"  # written by hand, stands at the head of the page
 TASKS = {  # in the paper's order
     "anymal_loco": "ANYmal D locomotion",
     "anymal_pedipulation": "Pedipulation",
@@ -235,6 +236,16 @@ def table_1(study, tasks=tuple(TASKS)):
     return markdown([*rows, row])
 
 
+def along_the_way(study):
+    """Not in the paper: iterations to half of PIDM random's final performance, and the mean of the whole training."""
+    methods = {"mlp": "MLP", "pidm_pretrained": "pretrained"}
+    names = {"to 50%": "iterations to 50%", "area": "mean of the training"}
+    columns = [(f"{title}: {label} [%]", m, n) for n, title in names.items() for m, label in methods.items()]
+    ran = {task: runs for task, runs in study.items() if "pidm_random" in runs}
+    rows = [{"task": TASKS[t]} | {head: cell(r, m, n) for head, m, n in columns} for t, r in ran.items()]
+    return markdown(rows) if rows else []
+
+
 def ablation(study, methods, tasks):
     """Final performance and iterations of `methods` (name -> title), a row each, for each task."""
     rows = []
@@ -419,7 +430,8 @@ def load_study(scale):
 
 def page(study, updates):
     """Text of results/README.md."""
-    lines = [HEAD, "## Table I", "", *table_1(study), "", "![curves](study/curves.png)", ""]
+    lines = [HEAD, DISCUSSION.read_text(), "## Table I", "", *table_1(study), "", "![curves](study/curves.png)", ""]
+    lines += ["Where the methods stand before they have converged:", "", *along_the_way(study), ""]
     climbing = ("anymal_climb_up", "anymal_climb_down")
     parts = {m: METHODS[m] for m in ("pidm_actor", "pidm_critic", "pidm_pretrained")}
     lines += ["## Table II: which network is pretrained", "", *ablation(study, parts, climbing), ""]
