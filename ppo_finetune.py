@@ -118,6 +118,8 @@ def merge(args, ppo):
         raise records.UserError("--pretrained loads a PIDM; leave out --network mlp")
     if args.init != "both" and not args.pretrained:
         raise records.UserError(f"--init {args.init} needs --pretrained CHECKPOINT")
+    if not args.core:
+        raise records.UserError("--core names no part; to load nothing leave out --pretrained")
     if args.core != CORE and not args.pretrained:
         raise records.UserError("--core chooses what is loaded from a checkpoint; name one with --pretrained")
     values = {"hidden": ppo["hidden"], "init_std": ppo["init_std"], "entropy_coef": ppo["entropy"]}

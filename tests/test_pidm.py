@@ -413,3 +413,4 @@ def test_batches_are_all_of_the_index_in_order(dataset):
 def test_init_without_pretrained_is_refused(refused):
     refused(finetune.main, finetune.Args(preset="smoke", init="shuffled"), "--init shuffled needs --pretrained")
     refused(finetune.main, finetune.Args(preset="smoke", core=("backbone",)), "--core chooses what is loaded")
+    refused(finetune.main, finetune.Args(preset="smoke", pretrained="a.msgpack", core=()), "--core names no part")
