@@ -137,6 +137,13 @@ def final(run):
     return run["indicator"][-max(len(run["indicator"]) // 20, 1) :].mean()
 
 
+def late_gain(run):
+    """Share of the final performance that the last third of the training brought: near 0 once the curve is flat."""
+    rows = len(run["indicator"])
+    end, width = max(2 * rows // 3, 1), max(rows // 20, 1)
+    return 1 - run["indicator"][end - width : end].mean() / final(run)
+
+
 def area(run):
     """Mean indicator over the whole training."""
     return np.nanmean(run["indicator"])
@@ -275,6 +282,7 @@ def details(runs):
             "method": METHODS[method],
             "seeds": ", ".join(str(run["seed"]) for run in mine),
             "final": f"{np.mean(values['final']):.4g} ± {np.std(values['final']):.2g}",
+            "of it in the last third [%]": f"{100 * np.mean([late_gain(run) for run in mine]):.0f}",
             "area [%]": "0" if method == "pidm_random" else cell(runs, method, "area"),
             "iterations to 50%": counts(values.get("to 50%", [np.nan])),
             "iterations to 90%": counts(values.get("to 90%", [np.nan])),

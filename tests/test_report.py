@@ -19,6 +19,11 @@ def test_final_is_the_mean_of_the_last_twentieth():
     assert report.final(curve([1.0, 2.0])) == 2.0
 
 
+def test_late_gain_is_what_the_last_third_brought():
+    assert report.late_gain(curve([*[1.0] * 20, *[8.0] * 20, *[10.0] * 20])) == pytest.approx(0.2)
+    assert report.late_gain(curve([3.0])) == 0.0
+
+
 def test_iterations_to_a_level():
     """Rises 1 an iteration: the mean of five rows that ends at iteration i is i - 2."""
     rising = curve(np.arange(1.0, 41.0))
