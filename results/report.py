@@ -233,7 +233,7 @@ def table_1(study, tasks=tuple(TASKS)):
         for i, (head, method, name) in enumerate(columns):
             row |= {head: cell(runs, method, name), "paper" + " " * i: paper(method, name, task)}
         rows.append(row)
-    row = {"task": "mean of the tasks that were run", "seeds": ""}
+    row = {"task": "mean of the tasks that have a figure", "seeds": ""}
     for i, (head, method, name) in enumerate(columns):
         found = {task: compare(study.get(task, {}), method, name) for task in TASKS}
         known = {task: value for task, value in found.items() if not isinstance(value, str)}
