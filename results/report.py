@@ -254,10 +254,10 @@ def along_the_way(study):
 
 
 def ablation(study, methods, tasks):
-    """Final performance and iterations of `methods` (name -> title), a row each, for each task."""
+    """Final performance and iterations of `methods` (name -> title), a row each, for each task; seeds in their order."""
     rows = []
     for method, title in methods.items():
-        row = {"method": title}
+        row = {"method": title, "seeds": " / ".join(str(len(study.get(task, {}).get(method, ()))) for task in tasks)}
         for i, task in enumerate(tasks):
             runs = study.get(task, {})
             for j, name in enumerate(("final", "to 90%")):
@@ -419,7 +419,8 @@ HEAD = """# Results
 Written by `python results/report.py` from the runs in [study](study); `--check` compares. Percentages are against PIDM
 random. Final performance is the mean indicator of the last 5% of a training (episode return of the noisy policy;
 parkour: progress of the curriculum), iterations those to 90% of PIDM random's final performance; less is better.
-Brackets are 95% bootstrap intervals over seeds; with few seeds they are rough, and with one there are none.
+Brackets are 95% bootstrap intervals over seeds; with few seeds they are rough, and beside a single one they hold the
+spread of PIDM random alone.
 """
 BEYOND = """`PIDM shuffled` has the pretrained weights permuted within each layer: the same scale, no knowledge.
 `orthogonal` has orthogonal first weights, our default, where the others have PyTorch's, as rsl_rl, a fork
