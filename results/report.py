@@ -254,7 +254,7 @@ def along_the_way(study):
 
 
 def ablation(study, methods, tasks):
-    """Final performance and iterations of `methods` (name -> title), a row each, for each task; seeds in their order."""
+    """Final performance and iterations of `methods` (name -> title), a row each, for each task, as are the seeds."""
     rows = []
     for method, title in methods.items():
         row = {"method": title, "seeds": " / ".join(str(len(study.get(task, {}).get(method, ()))) for task in tasks)}
