@@ -6,7 +6,8 @@
 
 engines   steps per second of the physics alone ("bare": random joint targets, as at the start of a training) and of the
           whole environment step ("env": engine, rewards, observations, resets), compile time and memory
-training  ppo_finetune.py with a task's preset, learning included, after compilation
+training  ppo_finetune.py with a task's preset, learning included, after compilation: of 512 environments on a CPU, of
+          each number on an accelerator
 seeds     five seeds in one program against one seed
 solver    how far a limit on the contact solver's iterations moves a control step of an exploring robot
 peers     PPO of rsl_rl and Brax, and how many times faster ours is ("ours": at the same widths); see peers.py
@@ -31,6 +32,9 @@ from typing import Literal
 
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
+
+# This process names the device while others measure on it: it must not take most of a GPU's memory.
+os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
 
 import jax
 import mujoco
@@ -140,8 +144,12 @@ def engine_rows(args):
 
 
 def training_rows(args):
-    for task in args.tasks:
-        yield {"task": task} | in_process(args.limit_s, "training", task, 512, args.hidden)
+    """Engine c with 512 environments on a CPU; on an accelerator each engine with each number of environments."""
+    on_cpu = jax.default_backend() == "cpu"
+    engines, counts = (("c",), (512,)) if on_cpu else (args.engines, args.counts)
+    for task, engine, count in itertools.product(args.tasks, engines, counts):
+        row = in_process(args.limit_s, "training", task, count, args.hidden, 1, ("--engine", engine))
+        yield {"task": task, "engine": engine} | row
 
 
 def seed_rows(args):

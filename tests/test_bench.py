@@ -32,6 +32,17 @@ def test_ratios():
     assert ratios == [(1.0, 1.0), (2.0, 2.0), (1.0, 100 / 60), (3.0, 5.0), (None, None)]
 
 
+def test_training_takes_what_the_device_is_for(monkeypatch):
+    """A CPU trains 512 environments on engine c; an accelerator each number of them on each engine."""
+    monkeypatch.setattr(bench, "in_process", lambda *inputs: {"asked": inputs[2:]})
+    args = bench.Args(tasks=("go1_loco",), engines=("mjx", "warp"), counts=(1024, 4096))
+    asked = [row["asked"] for row in bench.training_rows(args)]
+    assert asked == [("go1_loco", 512, None, 1, ("--engine", "c"))]
+    monkeypatch.setattr(bench.jax, "default_backend", lambda: "gpu")
+    asked = [(row["engine"], row["asked"][1], row["asked"][4][1]) for row in bench.training_rows(args)]
+    assert asked == [("mjx", 1024, "mjx"), ("mjx", 4096, "mjx"), ("warp", 1024, "warp"), ("warp", 4096, "warp")]
+
+
 @pytest.mark.parametrize(
     ("changes", "words"),
     [({"tasks": ("go2_loco",)}, ["unknown task 'go2_loco'"]), ({"parts": ("peers",)}, ["--peers PYTHON", "peers.py"])],
