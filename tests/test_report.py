@@ -104,6 +104,13 @@ def test_bad_runs_are_left_out_with_a_warning(study, capsys):
     assert "left out" in capsys.readouterr().err
 
 
+def test_without_a_baseline_there_is_no_level_to_reach(study):
+    runs = report.load_task(study[0])
+    assert "no PIDM random" not in report.details(runs)[2]
+    alone = {"mlp": runs["mlp"]}
+    assert report.details(alone)[2].count("no PIDM random") == 2 and "not reached" not in report.details(alone)[2]
+
+
 def test_sizes_are_those_that_were_pretrained_on(tmp_path, monkeypatch):
     monkeypatch.setattr(report, "ROOT", tmp_path)
     folder = tmp_path / "results/pidm/anymal_d"
