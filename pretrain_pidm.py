@@ -1,6 +1,7 @@
 """Stage 2: train a robot's PIDM to name the action between two states, on the data of stage 1 (paper Sec. IV-D).
 
     python pretrain_pidm.py --data runs/explore/g1/seed0
+    python pretrain_pidm.py --data runs/explore/g1/random --eval runs/pidm/g1/seed0/pidm.msgpack
 
 Writes pidm.msgpack, which `ppo_finetune.py --pretrained` reads, with its validation error and figures beside it.
 Reads top to bottom: arguments, networks, dataset, augmentation, loss, epochs, evaluation, figures, main.
@@ -43,6 +44,7 @@ class Args:
     resume: str | None = None  # a run folder: go on after its last epoch; all other arguments are those of that run
     tensorboard: bool = False  # every row goes to TensorBoard event files in the run folder as well
     distributed: bool = False  # one of several processes, one a host; process 0 writes the files
+    eval: str | None = None  # a pidm.msgpack: validate it on --data instead of training, write the figures beside it
     # --- Data ---
     num_samples: int | None = None  # train on this many transitions, drawn at random; None: all (paper: 7 M)
     noise: float = 1.0  # multiplies the tasks' sensor noise
@@ -361,8 +363,18 @@ def run_epoch(args, dataset, index, step, carry, epoch):
 # --- Evaluation ---
 
 
+def commanded_change(env, x, action):
+    """By how much joint targets differ from where the joints are: a_t - q_t [rad]. x (..., X), action (..., A)."""
+    angles = slice(6, 6 + env.action_dim)  # after ang_vel and gravity; minus the default pose, as targets are
+    return env.robot.action_scale * action - x[..., angles]
+
+
 def evaluate(args, env, net, variables, dataset, index):
-    """Predictions on validation transitions with the tasks' sensor noise: a^ and a (B, A), last action (B, A)."""
+    """The PIDM on validation transitions with the tasks' sensor noise, and what it is measured against.
+
+    Arrays (B, A) by name: predicted, action and last action [action units]; change [rad], by which the joint targets
+    differ from where the joints are (the paper's action magnitude |a_t - q_t|, Fig. 4b).
+    """
     width, parts = args.noise * noise_width(env), []
 
     @jax.jit
@@ -371,30 +383,40 @@ def evaluate(args, env, net, variables, dataset, index):
 
     for number, batch in enumerate(batches(dataset, index, 8192)):
         key = jax.random.fold_in(jax.random.key(1), number)
-        parts.append((np.asarray(one(variables, batch, key)), batch["action"], batch["past"][:, -1]))
-    return [np.concatenate(part) for part in zip(*parts, strict=True)]
+        parts.append(
+            {
+                "predicted": np.asarray(one(variables, batch, key)),
+                "action": batch["action"],
+                "last": batch["past"][:, -1],
+                "change": commanded_change(env, batch["prop"][:, -1], batch["action"]),
+            }
+        )
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
-def errors(env, dataset, predicted, action, last):
-    """Validation error in action units, in rad and over the mean action magnitude, and two baselines."""
-    error = np.abs(predicted - action).mean()
+def errors(env, dataset, outcome):
+    """Validation error in action units, in rad, over mean action and mean commanded change, and two baselines."""
+    action = outcome["action"]
+    error = np.abs(outcome["predicted"] - action).mean()
     sample = dataset.windows(np.sort(dataset.train[:: max(len(dataset.train) // 20_000, 1)]))["action"]
     return {
         "error": error,
         "error_rad": error * env.robot.action_scale,
         "normalized_error": error / np.abs(action).mean(),
+        "error_over_change": error * env.robot.action_scale / np.abs(outcome["change"]).mean(),
         "mean_action_error": np.abs(action - sample.mean(0)).mean(),
-        "last_action_error": np.abs(action - last).mean(),
+        "last_action_error": np.abs(action - outcome["last"]).mean(),
     }
 
 
 # --- Figures ---
 
 
-def plot_accuracy(env, predicted, action, path):
+def plot_accuracy(env, outcome, path):
     """Absolute and normalised error over action magnitude, every joint a sample (paper Fig. 4c)."""
     plt = records.pyplot()
-    size, error = (np.abs(x).ravel() * env.robot.action_scale for x in (action, predicted - action))
+    wrong = env.robot.action_scale * (outcome["predicted"] - outcome["action"])
+    size, error = (np.abs(x).ravel() for x in (outcome["change"], wrong))
     edges = np.linspace(0, np.quantile(size, 0.995), 21)
     bins = np.digitize(size, edges)
     rows = [(size[bins == i].mean(), error[bins == i]) for i in range(1, len(edges)) if (bins == i).sum() > 20]
@@ -407,7 +429,7 @@ def plot_accuracy(env, predicted, action, path):
         magnitude = [m for m, _ in rows]
         ax.plot(magnitude, [e.mean() * scale(m) for m, e in rows], label="mean")
         ax.fill_between(magnitude, quantiles[:, 0], quantiles[:, 2], alpha=0.25, label="25 % to 75 %")
-        ax.set(xlabel="action magnitude [rad]", title=title, ylim=(0, None))
+        ax.set(xlabel="action magnitude |a - q| [rad]", title=title, ylim=(0, None))
         ax.grid(alpha=0.3)
     axes[0].legend()
     axes[1].set_ylim(0, 2)
@@ -420,12 +442,13 @@ def plot_distribution(env, dataset, path):
     plt = records.pyplot()
     index = np.concatenate([dataset.train, dataset.validation])
     steps, column = np.divmod(np.sort(index[:: max(len(index) // 50_000, 1)]), dataset.x.shape[1])
-    size, rough = np.abs(dataset.action[steps, column]) * env.robot.action_scale, dataset.rough[steps, column]
+    size = np.abs(commanded_change(env, dataset.x[steps, column], dataset.action[steps, column]))
+    rough = dataset.rough[steps, column]
     fig, ax = plt.subplots(figsize=(4.5, 3), constrained_layout=True)
     for label, chosen in (("flat", ~rough), ("rough", rough)):
         if chosen.any():
             ax.hist(size[chosen].ravel(), bins=60, range=(0, size.max()), density=True, alpha=0.5, label=label)
-    ax.set(xlabel="action magnitude [rad]", ylabel="density")
+    ax.set(xlabel="action magnitude |a - q| [rad]", ylabel="density")
     ax.legend()
     fig.savefig(path, dpi=110, metadata={"Software": None})
     plt.close(fig)
@@ -448,17 +471,33 @@ def checkpoint_meta(args, dataset, sizes, metrics):
     }
 
 
-def pretrain(args):
-    """Train, keep the weights of the best epoch, report and draw."""
+def open_data(args):
+    """The collection args.data and its robot's environment. UserError if they do not fit together."""
     dataset = Dataset(args.data, args.delta_steps)
     robot = dataset.meta["robot"]
-    args, env = merge(args, robot), envs.make_explore(robot, "c")
+    env = envs.make_explore(robot, "c")
     if dataset.meta["layout"] != list(env.prop_layout):
         raise records.UserError(f"{args.data} has x = {dataset.meta['layout']}, not {list(env.prop_layout)}")
     for name, width in (("x", env.prop_dim), ("action", env.action_dim)):
         if getattr(dataset, name).shape[-1] != width:
             found = getattr(dataset, name).shape[-1]
             raise records.UserError(f"{args.data}/{name}.npy holds {found} numbers a step, {robot} has {width}")
+    return dataset, env
+
+
+def init_variables(args, env, net, windows):
+    """Fresh params, and a normalizer measured on these windows."""
+    k_init, k_norm = jax.random.split(jax.random.key(args.seed))
+    history = (env.config.history + 1) * env.prop_dim + env.config.history * env.action_dim
+    params = net.init(k_init, jnp.zeros(history), jnp.zeros(env.prop_dim))
+    return params | {"normalizer": make_normalizer(args, env, k_norm, windows)}
+
+
+def pretrain(args):
+    """Train, keep the weights of the best epoch, report and draw."""
+    dataset, env = open_data(args)
+    robot = env.robot.name
+    args = merge(args, robot)
     count = len(dataset.train) if args.num_samples is None else args.num_samples
     if not 1 <= count <= len(dataset.train):
         raise records.UserError(f"--num-samples {count} is not within 1 and the {len(dataset.train)} in {args.data}")
@@ -467,10 +506,7 @@ def pretrain(args):
     print("  ".join(f"{name}={value}" for name, value in dataclasses.asdict(args).items()), flush=True)
 
     net = PIDM(SIZES[robot], env.action_dim)
-    k_init, k_norm = jax.random.split(jax.random.key(args.seed))
-    norm = make_normalizer(args, env, k_norm, dataset.windows(np.sort(order[:100_000])))
-    history = (env.config.history + 1) * env.prop_dim + env.config.history * env.action_dim
-    variables = net.init(k_init, jnp.zeros(history), jnp.zeros(env.prop_dim)) | {"normalizer": norm}
+    variables = init_variables(args, env, net, dataset.windows(np.sort(order[:100_000])))
     opt = optax.adam(optax.cosine_decay_schedule(args.lr, args.epochs * max(count // args.batch, 1)))
     step, carry = make_step(args, env, net, opt), (variables, opt.init(variables["params"]))
     rows, out = [], Path(args.run_dir) if devices.is_first() else None
@@ -495,7 +531,7 @@ def run_epochs(args, env, net, dataset, order, step, carry, out, rows):
             last = time.perf_counter()
             carry, loss = run_epoch(args, dataset, order, step, carry, len(rows))
             speed = len(order) / (time.perf_counter() - last)
-            metrics = errors(env, dataset, *evaluate(args, env, net, carry[0], dataset, few))
+            metrics = errors(env, dataset, evaluate(args, env, net, carry[0], dataset, few))
             row = {"iteration": len(rows) + 1, "samples": len(order) * (len(rows) + 1)}
             row |= {"seconds": time.perf_counter() - start, "train_error": loss, **metrics}
             rows.append({name: float(f"{value:.6g}") for name, value in row.items()})
@@ -515,21 +551,42 @@ def run_epochs(args, env, net, dataset, order, step, carry, out, rows):
 def report(args, env, net, dataset, rows, out):
     """Errors of the kept weights on the whole validation split, and the figures."""
     variables, _ = records.load(out / "pidm.msgpack", "PIDM checkpoint")
-    outcome = evaluate(args, env, net, variables, dataset, dataset.validation)
-    result = {name: float(x) for name, x in errors(env, dataset, *outcome).items()}
-    records.replace_text(out / "validation.json", json.dumps(result, indent=1) + "\n")
     records.plot_curves(rows, ("normalized_error",), {"L1": ["train_error", "error"]}, out / "curve.png", "samples")
-    plot_accuracy(env, *outcome[:2], out / "accuracy.png")
+    print(f"wrote {out}/pidm.msgpack, metrics.csv, curve.png")
+    validate(args, env, net, variables, dataset, out)
+
+
+def validate(args, env, net, variables, dataset, out):
+    """Write validation.json, accuracy.png and distribution.png of these weights on a collection's validation split."""
+    outcome = evaluate(args, env, net, variables, dataset, dataset.validation)
+    result = {name: float(x) for name, x in errors(env, dataset, outcome).items()}
+    records.replace_text(out / "validation.json", json.dumps(result, indent=1) + "\n")
+    plot_accuracy(env, outcome, out / "accuracy.png")
     plot_distribution(env, dataset, out / "distribution.png")
     print("validation:", records.line(result))
-    print(f"wrote {out}/pidm.msgpack, metrics.csv, curve.png, accuracy.png, distribution.png")
+    print(f"wrote {out}/validation.json, accuracy.png, distribution.png")
+
+
+def run_validation(args):
+    """--eval: how well a PIDM that exists names the actions of a collection. UserError if it is not one for it."""
+    path = Path(args.eval)
+    variables, meta = records.load(path, "PIDM checkpoint")
+    args = dataclasses.replace(args, delta_steps=meta.get("args", {}).get("delta_steps", 1))  # as it was trained
+    dataset, env = open_data(args)
+    for name in ("robot", "layout", "history"):
+        if meta[name] != dataset.meta[name]:
+            raise records.UserError(f"{path} was made for {name} {meta[name]}, {args.data} has {dataset.meta[name]}")
+    net = PIDM(SIZES[env.robot.name], env.action_dim)
+    like = jax.eval_shape(partial(init_variables, args, env, net), dataset.windows(dataset.validation[:1]))
+    records.check_shapes(path, variables, like)
+    validate(args, env, net, variables, dataset, path.parent)
 
 
 def main(args):
     """Train a PIDM. What a user can mend ends in one line and exit code 2."""
     with records.one_line_errors():
         devices.join(args.distributed)
-        return pretrain(records.resumed(args) if args.resume else args)
+        return run_validation(args) if args.eval else pretrain(records.resumed(args) if args.resume else args)
 
 
 if __name__ == "__main__":

@@ -316,7 +316,50 @@ def test_normalizer_is_not_trained(pretrained, tmp_path):
     assert np.abs(backbone - pidm["params"]["backbone"]["Dense_0"]["kernel"]).max() > 0
 
 
+def test_commanded_change_is_target_minus_joint_angle(go1):
+    """In MuJoCo's own numbers: what the position actuators are told, minus where their joints are."""
+    state = jax.jit(go1.reset)(jax.random.key(0))
+    angles = np.asarray(state.physics.qpos)[7:] + 0.1
+    x = np.concatenate([np.full(6, 9.0), angles - np.array(go1.robot.default_pose), np.full(A, 9.0)])
+    action = np.linspace(-2, 2, A)
+    targets = np.array(go1.robot.default_pose) + go1.robot.action_scale * action
+    np.testing.assert_allclose(script.commanded_change(go1, x, action), targets - angles, atol=1e-6)
+
+
+def test_errors_on_made_up_predictions(go1, dataset):
+    """All actions 2 and predicted as 1.5, joints commanded to move by 0.25 rad."""
+    action = np.full((4, A), 2.0)
+    outcome = {"predicted": action - 0.5, "action": action, "last": action - 1, "change": np.full((4, A), -0.25)}
+    found = script.errors(go1, dataset, outcome)
+    want = {"error": 0.5, "error_rad": 0.125, "normalized_error": 0.25, "error_over_change": 0.5}
+    assert {name: found[name] for name in want} == pytest.approx(want)
+    assert found["last_action_error"] == pytest.approx(1.0)
+
+
+def test_eval_repeats_the_validation(pretrained, tmp_path):
+    """--eval on the collection that a PIDM came from finds the errors that its training reported."""
+    wanted = json.loads((pretrained / "validation.json").read_text())
+    path = tmp_path / "pidm.msgpack"
+    path.write_bytes((pretrained / "pidm.msgpack").read_bytes())
+    script.main(script.Args(data=str(pretrained.parent / "data"), noise=0.0, eval=str(path)))
+    assert json.loads((tmp_path / "validation.json").read_text()) == pytest.approx(wanted)
+    assert {"accuracy.png", "distribution.png"} <= {file.name for file in tmp_path.iterdir()}
+
+
 # --- bad input ---
+
+
+def test_eval_of_another_robots_pidm_is_refused(pretrained, folder, tmp_path, refused):
+    params, meta = records.load(pretrained / "pidm.msgpack", "PIDM checkpoint")
+    for name, value in (("robot", "g1"), ("history", 3)):
+        other = tmp_path / f"{name}.msgpack"
+        records.save(other, params, meta | {name: value})
+        refused(script.main, script.Args(data=str(folder), eval=str(other)), f"{name} {value}", f"has {meta[name]}")
+    cut = tmp_path / "cut.msgpack"
+    records.save(cut, jax.tree.map(lambda x: x[..., :-1], params), meta)
+    refused(script.main, script.Args(data=str(folder), eval=str(cut)), "this task needs")
+    refused(script.main, script.Args(data=str(folder), eval=str(tmp_path / "none")), "cannot read PIDM checkpoint")
+    assert not (tmp_path / "validation.json").exists()
 
 
 def test_bad_datasets_are_refused(tmp_path, refused):
