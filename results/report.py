@@ -271,14 +271,12 @@ def ablation(study, methods, tasks):
 
 
 def details(runs):
-    """Lines about one task: every method in absolute figures, and how step size and noise went."""
+    """Lines of two tables about one task: every method in absolute figures; its mean action, step size and noise."""
     functions = measures(runs) if "pidm_random" in runs else {"final": final, "area": area}
-    rows = []
+    progress, ends = [], []
     for method, mine in runs.items():
         values = {name: [function(run) for run in mine] for name, function in functions.items()}
         last = {name: np.mean([run["columns"][name][-1] for run in mine]) for name in ("action_std", "seconds")}
-        shrink = [np.log(r["columns"]["action_std"][-1] / r["columns"]["action_std"][0]) for r in mine]
-        steps = [r["columns"]["lr"].sum() for r in mine]
         row = {
             "method": METHODS[method],
             "seeds": ", ".join(str(run["seed"]) for run in mine),
@@ -288,16 +286,19 @@ def details(runs):
             "iterations to 50%": counts(values["to 50%"]) if "to 50%" in values else "no PIDM random",
             "iterations to 90%": counts(values["to 90%"]) if "to 90%" in values else "no PIDM random",
         }
+        progress.append(row | {"minutes": f"{last['seconds'] / 60:.1f}"})
+        row = {"method": METHODS[method]}
         for name in sorted(mine[0]["errors"].keys() - {"diverged"}):
             row[f"mean action: {name}"] = f"{np.mean([run['errors'][name] for run in mine]):.3g}"
+        shrink = [np.log(r["columns"]["action_std"][-1] / r["columns"]["action_std"][0]) for r in mine]
+        steps = [r["columns"]["lr"].sum() for r in mine]
         row |= {
             "mean step size": f"{np.mean([r['columns']['lr'].mean() for r in mine]):.3g}",
             "final action std": f"{last['action_std']:.3f}",
             "change of log std over summed step sizes": f"{np.mean(np.divide(shrink, steps)):.0f}",
-            "minutes": f"{last['seconds'] / 60:.1f}",
         }
-        rows.append(row)
-    return markdown(rows)
+        ends.append(row)
+    return [*markdown(progress), "", *markdown(ends)]
 
 
 def counts(values):
