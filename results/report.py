@@ -442,7 +442,7 @@ of which the paper used.
 `history encoder only` leaves the backbone fresh; `scaled` halves the loaded backbone's output; `slow start` lets
 loaded parts move little in the first 50 iterations.
 """
-PIDM = """Mean error of the shipped checkpoints on held-out environments with sensor noise. The action magnitude is
+PIDM = """Mean error of the shipped checkpoints on a collection that they have not seen. The action magnitude is
 |a_t - q_t|, by how much joint targets differ from where the joints are. The figures are ANYmal D's, as in the paper,
 where most actions are smaller than 1 rad and most errors than 0.4 rad. [pidm](pidm/README.md) has the other robots.
 """
