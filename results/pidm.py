@@ -267,14 +267,13 @@ Made by `python results/pidm.py`, which runs, for each robot,
 
 Errors are on held-out environments, with the tasks' sensor noise. error_over_change is error_rad over the mean distance
 of joint targets from where the joints are, |a_t - q_t|: the paper's normalised error, 0.4 to 0.5 there;
-normalized_error is over the mean action. Those that have error_over_change were measured (`--stages collect validate`)
-on collections made anew by the same commands on another machine. Those are not the same to the bit, so the weights have
-seen nothing of them; the last row of metrics.csv is on the collection that they were trained on. Joint space is the
-share of a 20 x 20 grid over each pair of neighbouring joints of a limb that 20,000 samples visit. Disagreement is that
-of an ensemble trained on the first tenth of the collection, there and on the last tenth. The recorded policy is that of
-results/tasks, with its noise: how well the PIDM knows a gait that it never saw. Features are the outputs of the actor's
-backbone over the first rollout of a task; their effective rank (Roy and Vetterli 2007) is the number of directions, of
-64, that they fill.
+normalized_error is over the mean action. They were measured (`--stages collect validate`) on collections made anew by
+the same commands on another machine. Those are not the same to the bit, so the weights have seen nothing of them; the
+last row of metrics.csv is on the collection that they were trained on. Joint space is the share of a 20 x 20 grid over
+each pair of neighbouring joints of a limb that 20,000 samples visit. Disagreement is that of an ensemble trained on the
+first tenth of the collection, there and on the last tenth. The recorded policy is that of results/tasks, with its
+noise: how well the PIDM knows a gait that it never saw. Features are the outputs of the actor's backbone over the first
+rollout of a task; their effective rank (Roy and Vetterli 2007) is the number of directions, of 64, that they fill.
 
 """
 

@@ -317,13 +317,14 @@ def test_normalizer_is_not_trained(pretrained, tmp_path):
 
 
 def test_commanded_change_is_target_minus_joint_angle(go1):
-    """In MuJoCo's own numbers: what the position actuators are told, minus where their joints are."""
-    state = jax.jit(go1.reset)(jax.random.key(0))
-    angles = np.asarray(state.physics.qpos)[7:] + 0.1
-    x = np.concatenate([np.full(6, 9.0), angles - np.array(go1.robot.default_pose), np.full(A, 9.0)])
-    action = np.linspace(-2, 2, A)
-    targets = np.array(go1.robot.default_pose) + go1.robot.action_scale * action
-    np.testing.assert_allclose(script.commanded_change(go1, x, action), targets - angles, atol=1e-6)
+    """What MuJoCo's position actuators were told in a step, minus where their joints were before it."""
+    state = jax.jit(jax.vmap(go1.reset))(jax.random.split(jax.random.key(0), 1))
+    action = jnp.linspace(-2, 2, A)[None]
+    angles = jax.vmap(go1.motion)(state.physics).joint_pos
+    x = jnp.concatenate([jnp.full((1, 6), 9.0), angles, jnp.full((1, A), 9.0)], 1)
+    jax.block_until_ready(jax.jit(jax.vmap(go1.step))(state, action))
+    told = np.array(go1.engine.batch(1).bind("ctrl")).ravel()
+    np.testing.assert_allclose(script.commanded_change(go1, x, action)[0], told - state.physics.qpos[0, 7:], atol=1e-5)
 
 
 def test_errors_on_made_up_predictions(go1, dataset):
