@@ -280,7 +280,7 @@ def details(runs):
         row = {
             "method": METHODS[method],
             "seeds": ", ".join(str(run["seed"]) for run in mine),
-            "final": f"{np.mean(values['final']):.4g} ± {np.std(values['final']):.2g}",
+            "final": spread(values["final"]),
             "of it in the last third [%]": f"{100 * np.mean([late_gain(run) for run in mine]):.0f}",
             "area [%]": "0" if method == "pidm_random" else cell(runs, method, "area"),
             "iterations to 50%": counts(values["to 50%"]) if "to 50%" in values else "no PIDM random",
@@ -299,6 +299,11 @@ def details(runs):
         }
         ends.append(row)
     return [*markdown(progress), "", *markdown(ends)]
+
+
+def spread(values):
+    """Mean and std over seeds; a single seed has no std."""
+    return f"{np.mean(values):.4g}" + (f" ± {np.std(values):.2g}" if len(values) > 1 else "")
 
 
 def counts(values):
@@ -432,8 +437,8 @@ HEAD = """# Results
 Written by `python results/report.py` from the runs in [study](study); `--check` compares. Percentages are against PIDM
 random. Final performance is the mean indicator of the last 5% of a training (episode return of the noisy policy;
 parkour: progress of the curriculum), iterations those to 90% of PIDM random's final performance; less is better.
-Brackets are 95% bootstrap intervals over seeds; with few seeds they are rough, and beside a single one they hold the
-spread of PIDM random alone.
+Brackets are 95% bootstrap intervals over seeds; with few seeds they are rough, beside a single one they hold the spread
+of PIDM random alone, and where both have one there is none, nor does that task widen the mean's.
 """
 BEYOND = """`PIDM shuffled` has the pretrained weights permuted within each layer: the same scale, no knowledge.
 `orthogonal` has orthogonal first weights, our default, where the others have PyTorch's, as rsl_rl, a fork

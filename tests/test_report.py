@@ -38,6 +38,11 @@ def test_interval_by_hand():
     assert (float(low), float(high)) == (-20.0, 20.0)
 
 
+def test_a_single_seed_has_no_std():
+    assert report.spread([12.5]) == "12.5"
+    assert report.spread([9.0, 11.0]) == "10 ± 1"
+
+
 def test_what_was_not_run_or_not_reached_is_said():
     runs = {"pidm_random": [curve([10.0] * 10)], "mlp": [curve([10.0] * 10), curve([1.0] * 10)]}
     assert report.cell(runs, "mlp", "to 90%") == "not reached by 1 of 2"
