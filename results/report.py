@@ -183,16 +183,21 @@ def interval(middle, draws):
     return f"{middle:+.1f} [{np.quantile(draws, 0.025):+.1f}, {np.quantile(draws, 0.975):+.1f}]"
 
 
-def compare(runs, method, name):
-    """Percent of one measure against PIDM random with draws; or words, where there is none."""
+def compare(runs, method, name, at_least=False):
+    """Percent of one measure against PIDM random with draws; or words, where there is none.
+
+    With at_least, runs that never reach a level count as if they did at their last iteration.
+    """
     if method not in runs or "pidm_random" not in runs:
         return "not run"
     measure = measures(runs)[name]
-    values, baseline = ([measure(run) for run in runs[m]] for m in (method, "pidm_random"))
-    missing = int(np.isnan(values).sum())
-    if missing or np.isnan(baseline).any():
-        return f"not reached by {missing} of {len(values)}"
-    return percent(values, baseline)
+    values, baseline = (np.array([measure(run) for run in runs[m]]) for m in (method, "pidm_random"))
+    missing = np.isnan(values)
+    if np.isnan(baseline).any():
+        return f"not reached by {np.isnan(baseline).sum()} of {len(baseline)} PIDM random"
+    if missing.any() and not at_least:
+        return f"not reached by {missing.sum()} of {len(values)}"
+    return percent(np.where(missing, [run["iteration"][-1] for run in runs[method]], values), baseline)
 
 
 def cell(runs, method, name):
@@ -234,14 +239,23 @@ def table_1(study, tasks=tuple(TASKS)):
         for i, (head, method, name) in enumerate(columns):
             row |= {head: cell(runs, method, name), "paper" + " " * i: paper(method, name, task)}
         rows.append(row)
-    row = {"task": "mean of the tasks that have a figure", "seeds": ""}
+    row = {"task": "mean of the tasks that were run", "seeds": ""}
     for i, (head, method, name) in enumerate(columns):
-        found = {task: compare(study.get(task, {}), method, name) for task in TASKS}
-        known = {task: value for task, value in found.items() if not isinstance(value, str)}
-        mean = interval(*(np.mean(x, axis=0) for x in zip(*known.values(), strict=True))) if known else "not run"
+        mean, known = mean_over_tasks(study, method, name)
         theirs = [dict(zip(TASKS, PAPER[name][method], strict=False))[task] for task in known]
         row |= {head: mean, "paper" + " " * i: f"{np.mean(theirs):+.1f}" if known else ""}
     return markdown([*rows, row])
+
+
+def mean_over_tasks(study, method, name):
+    """Mean percentage with its interval as text, "at least" where a run never got there; and the tasks it is of."""
+    found = {task: compare(study.get(task, {}), method, name, at_least=True) for task in TASKS}
+    known = {task: value for task, value in found.items() if not isinstance(value, str)}
+    if not known:
+        return "not run", known
+    text = interval(*(np.mean(x, axis=0) for x in zip(*known.values(), strict=True)))
+    bound = any(isinstance(compare(study[task], method, name), str) for task in known)
+    return ("at least " if bound else "") + text, known
 
 
 def along_the_way(study):
@@ -438,7 +452,8 @@ Written by `python results/report.py` from the runs in [study](study); `--check`
 random. Final performance is the mean indicator of the last 5% of a training (episode return of the noisy policy;
 parkour: progress of the curriculum), iterations those to 90% of PIDM random's final performance; less is better.
 Brackets are 95% bootstrap intervals over seeds; with few seeds they are rough, beside a single one they hold the spread
-of PIDM random alone, and where both have one there is none, nor does that task widen the mean's.
+of PIDM random alone, and where both have one there is none, nor does that task widen the mean's. Where the mean says
+"at least", a run that never got to 90% counts as if it had with its last iteration.
 """
 BEYOND = """`PIDM shuffled` has the pretrained weights permuted within each layer: the same scale, no knowledge.
 `orthogonal` has orthogonal first weights, our default, where the others have PyTorch's, as rsl_rl, a fork

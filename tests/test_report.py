@@ -49,6 +49,8 @@ def test_what_was_not_run_or_not_reached_is_said():
     assert report.cell(runs, "mlp", "final").startswith("-45.0 [-90.0, ")
     assert report.cell(runs, "pidm_pretrained", "final") == "not run"
     assert report.cell({}, "mlp", "final") == "not run"
+    runs = {"pidm_random": [curve([1.0] * 10), curve([9.0] * 10)], "mlp": [curve([10.0] * 10)]}
+    assert report.cell(runs, "mlp", "to 90%") == "not reached by 1 of 2 PIDM random"
 
 
 def test_mean_over_tasks_is_of_those_that_were_run():
@@ -61,6 +63,19 @@ def test_mean_over_tasks_is_of_those_that_were_run():
     }
     line = report.table_1(study)[-1].split(" | ")
     assert line[2:4] == ["-10.0", "+0.2"] and line[4:6] == ["not run", ""]
+
+
+def test_mean_counts_a_run_that_never_got_there_by_its_length():
+    """PIDM random is there at row 5, as is one MLP; the other is not at row 10: +0 and at least +100."""
+    ten = curve([10.0] * 10)
+    study = {
+        "go1_loco": {"pidm_random": [ten], "mlp": [ten]},
+        "g1_loco": {"pidm_random": [ten], "mlp": [curve([1.0] * 10)]},
+    }
+    assert report.cell(study["g1_loco"], "mlp", "to 90%") == "not reached by 1 of 1"
+    text, tasks = report.mean_over_tasks(study, "mlp", "to 90%")
+    assert text == "at least +50.0" and list(tasks) == ["go1_loco", "g1_loco"]
+    assert report.mean_over_tasks({"go1_loco": study["go1_loco"]}, "mlp", "to 90%")[0] == "+0.0"
 
 
 def test_the_paper_s_means_are_those_it_prints():
