@@ -709,7 +709,8 @@ def run_eval(args):
     """--eval: print the task's metrics of a saved policy, on its own commands and in the showcase; write pictures."""
     from envs import render  # matplotlib and OpenGL are slow to load and not needed for training
 
-    env, show, path = make_env(args), make_env(args, **showcase(args)), Path(args.eval)
+    env, show = (make_env(args, **fields) for fields in (envs.TASKS[args.task][0].EVALUATION, showcase(args)))
+    path = Path(args.eval)
     net, params = load_policy(args, env)
     report = {}
     run = jax.jit(lambda params, level: evaluate(env, net, params, args.eval_envs, level)[0])

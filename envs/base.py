@@ -186,7 +186,8 @@ class Env:
     # observation block -> (mirror kind, fixed scale); order is the order of the vector
     OBS: dict[str, tuple] = {}
     bootstrap_time_outs = True  # V(final_obs) follows a time limit; not where the policy sees the time left
-    SHOWCASE: dict = {}  # config fields for the pictures of a trained policy
+    EVALUATION: dict = {}  # config fields for the measures of a trained policy
+    SHOWCASE: dict = {}  # and for its pictures
     FILM: dict = {}  # which part of an episode they show; see render.film
     COMMAND: dict[str, tuple] = {}  # what a person who watches may ask for: name -> (low, high); see `tell`
 

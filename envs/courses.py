@@ -1,8 +1,8 @@
 """Obstacle courses of the five parkour skills: which slabs a scene has, and where a level puts them.
 
-A course is drawn as (poses, goal): poses (M, 4) of slab centres x, y, z [m] and tilt about y [rad] in the order of the
-skill's slabs, and the goal (3,) for the base [m]. The robot starts at x = 0 and faces +x. `t` is the level's difficulty
-from 0 to 1. Sizes and ranges: Hoeller et al. 2023 where published, else ours.
+An obstacle is drawn as (poses, goal): poses (M, 4) of slab centres x, y, z [m] and tilt about y [rad] in the order of
+the skill's slabs, and the goal (3,) for the base [m]. The robot starts at x = 0 and faces +x. `t` is the level's
+difficulty from 0 to 1. Sizes and ranges: Hoeller et al. 2023 where published, else ours.
 """
 
 from collections.abc import Callable
@@ -23,7 +23,6 @@ LANDING = Slab("landing", (1.5, 2.0, 1.2))
 TILES = tuple(Slab(f"tile{i}", (0.25, 0.25, 0.15)) for i in range(12))
 
 TREAD, STEPS, SLOPE_LENGTH = 0.30, len(PLANKS), 2 * RAMP.half[0]  # [m]
-ROUGH = 0.2  # share of episodes on rough tiles instead of the obstacle
 
 
 def pose(x, z, tilt=0.0, y=0.0):
@@ -38,55 +37,45 @@ def between(t, easy, hard):
     return easy + t * (hard - easy)
 
 
-def tiles(key, t):
-    """Twelve tiles (12, 4) of random height about the way ahead."""
-    k_x, k_y, k_z = jax.random.split(key, 3)
+def rough_ground(key, t):
+    """Twelve tiles (12, 4) of random height about the way ahead, and a goal 2 to 4 m away."""
+    k_x, k_y, k_z, k_gx, k_gy = jax.random.split(key, 5)
     x, y = uniform(k_x, 0.9, 3.5, (12,)), uniform(k_y, -0.8, 0.8, (12,))
     top = uniform(k_z, 0.0, between(t, 0.02, 0.08), (12,))
-    return jnp.stack([x, y, top - TILES[0].half[2], jnp.zeros(12)], -1)
-
-
-def or_rough(obstacles, without, goal, key, t):
-    """The obstacles with all tiles away, or in a share of the episodes tiles alone and a goal 2 to 4 m ahead."""
-    k_share, k_tiles, k_x = jax.random.split(key, 3)
-    rough = uniform(k_share, 0.0, 1.0) < ROUGH
-    slabs = jnp.where(rough, jnp.array(without), jnp.stack(obstacles))
-    tiled = jnp.where(rough, tiles(k_tiles, t), jnp.array(AWAY))
-    flat_goal = jnp.stack([uniform(k_x, 2.0, 4.0), goal[1], jnp.float32(0.5)])
-    return jnp.concatenate([slabs, tiled]), jnp.where(rough, flat_goal, goal)
+    goal = jnp.stack([uniform(k_gx, 2.0, 4.0), uniform(k_gy, -0.3, 0.3), jnp.float32(0.5)])
+    return jnp.stack([x, y, top - TILES[0].half[2], jnp.zeros(12)], -1), goal
 
 
 def climb_up(key, t):
     """A box of 0.1 to 1.0 m; the goal is on it."""
-    k_x, k_gx, k_gy, k_rough = jax.random.split(key, 4)
+    k_x, k_gx, k_gy = jax.random.split(key, 3)
     x, height = uniform(k_x, 1.0, 1.5), between(t, 0.1, 1.0)
     goal = jnp.stack([x + uniform(k_gx, 1.0, 1.5), uniform(k_gy, -0.3, 0.3), height + 0.5])
-    return or_rough([pose(x + 1.5, height - 1.0)], [AWAY], goal, k_rough, t)
+    return pose(x + 1.5, height - 1.0)[None], goal
 
 
 def climb_down(key, t):
     """The robot starts on a box of 0.1 to 1.0 m; the goal is on the floor before it."""
-    k_x, k_gx, k_gy, k_rough = jax.random.split(key, 4)
+    k_x, k_gx, k_gy = jax.random.split(key, 3)
     x, height = uniform(k_x, 0.7, 1.0), between(t, 0.1, 1.0)
     goal = jnp.stack([x + uniform(k_gx, 1.2, 1.8), uniform(k_gy, -0.3, 0.3), jnp.float32(0.5)])
-    return or_rough([pose(x - 1.5, height - 1.0)], [AWAY], goal, k_rough, t)
+    return pose(x - 1.5, height - 1.0)[None], goal
 
 
 def crouch(key, t):
     """A table whose underside is 0.9 to 0.4 m above the floor; the goal is behind it."""
-    k_x, k_gx, k_gy, k_rough = jax.random.split(key, 4)
+    k_x, k_gx, k_gy = jax.random.split(key, 3)
     x, clearance = uniform(k_x, 1.0, 1.5), between(t, 0.9, 0.4)
     goal = jnp.stack([x + 1.5 + uniform(k_gx, 0.8, 1.2), uniform(k_gy, -0.3, 0.3), jnp.float32(0.5)])
-    return or_rough([pose(x + 0.75, clearance + 0.25)], [AWAY], goal, k_rough, t)
+    return pose(x + 0.75, clearance + 0.25)[None], goal
 
 
 def jump(key, t):
     """A gap of 0.1 to 1.0 m between platforms over a floor 1 m below; the goal is behind it."""
-    k_x, k_gx, k_gy, k_rough = jax.random.split(key, 4)
+    k_x, k_gx, k_gy = jax.random.split(key, 3)
     x, width = uniform(k_x, 1.0, 1.5), between(t, 0.1, 1.0)
     goal = jnp.stack([x + width + uniform(k_gx, 1.0, 1.5), uniform(k_gy, -0.3, 0.3), jnp.float32(0.5)])
-    closed = [(0.0, 0.0, -0.5, 0.0), (3.0, 0.0, -0.5, 0.0)]
-    return or_rough([pose(x - 1.5, -0.5), pose(x + width + 1.5, -0.5)], closed, goal, k_rough, t)
+    return jnp.stack([pose(x - 1.5, -0.5), pose(x + width + 1.5, -0.5)]), goal
 
 
 def walk(key, t):
@@ -126,14 +115,33 @@ class Skill:
     """Slabs of a scene, where a level puts them, and the height of the floor below."""
 
     slabs: tuple[Slab, ...]
-    draw: Callable  # (key, t) -> poses, goal
+    obstacle: Callable  # (key, t) -> poses, goal
     floor: float = 0.0  # [m]
+    plain: tuple = ()  # poses of the obstacle's slabs in an episode on rough tiles; (): there are none
 
 
 SKILLS = {
     "walk": Skill((*PLANKS, RAMP, LANDING), walk),
-    "climb_up": Skill((BLOCK, *TILES), climb_up),
-    "climb_down": Skill((BLOCK, *TILES), climb_down),
-    "crouch": Skill((TABLE, *TILES), crouch),
-    "jump": Skill((NEAR, FAR, *TILES), jump, floor=-1.0),
+    "climb_up": Skill((BLOCK,), climb_up, plain=(AWAY,)),
+    "climb_down": Skill((BLOCK,), climb_down, plain=(AWAY,)),
+    "crouch": Skill((TABLE,), crouch, plain=(AWAY,)),
+    "jump": Skill((NEAR, FAR), jump, floor=-1.0, plain=((0.0, 0.0, -0.5, 0.0), (3.0, 0.0, -0.5, 0.0))),  # no gap
 }
+
+
+def all_slabs(skill):
+    """The obstacle's slabs, and tiles after them where the skill has episodes on rough ground."""
+    return (*skill.slabs, *TILES) if skill.plain else skill.slabs
+
+
+def draw(skill, key, t, share):
+    """Poses of all_slabs, the goal, and whether this is one of the `share` of episodes without the obstacle."""
+    if not skill.plain:
+        return *skill.obstacle(key, t), jnp.asarray(False)
+    k_share, k_obstacle, k_rough = jax.random.split(key, 3)
+    poses, goal = skill.obstacle(k_obstacle, t)
+    tiles, far_goal = rough_ground(k_rough, t)
+    rough = uniform(k_share, 0.0, 1.0) < share
+    obstacle = jnp.concatenate([poses, jnp.tile(jnp.array([AWAY]), (len(TILES), 1))])
+    ground = jnp.concatenate([jnp.array(skill.plain), tiles])
+    return jnp.where(rough, ground, obstacle), jnp.where(rough, far_goal, goal), rough

@@ -48,7 +48,7 @@ def main():
     tasks = [task for task, (family, _) in envs.TASKS.items() if family is parkour.Parkour]
     sheet = Image.new("RGB", (render.WIDTH * len(LEVELS), render.HEIGHT * len(tasks)), "white")
     for row, task in enumerate(tasks):
-        env = envs.make(task, "c", noise=0.0)
+        env = envs.make(task, "c", noise=0.0, rough=0.0)
         for column, level in enumerate(LEVELS):
             image = picture(env, level, jax.random.key(3))
             ImageDraw.Draw(image).text((6, 4), f"{task}, level {level}", fill=(20, 20, 20))

@@ -96,7 +96,7 @@ def test_robots_start_on_the_ground_and_inside_nothing(task, started):
 
 
 def slab(name, skill, poses):
-    names = [slab.name for slab in courses.SKILLS[skill].slabs]
+    names = [slab.name for slab in courses.all_slabs(courses.SKILLS[skill])]
     return np.asarray(poses)[:, names.index(name)]
 
 
@@ -105,11 +105,13 @@ def test_levels_are_what_the_table_says(level):
     """Box height, clearance, gap and stair rise of a level; a fifth of the episodes have rough tiles instead."""
     t = level / 9
     keys = jax.random.split(jax.random.key(level), 300)
-    draw = {skill: jax.vmap(lambda k, s=skill: courses.SKILLS[s].draw(k, t))(keys) for skill in courses.SKILLS}
+    draw = {
+        name: jax.vmap(lambda k, s=skill: courses.draw(s, k, t, 0.2))(keys) for name, skill in courses.SKILLS.items()
+    }
     for skill, height in (("climb_up", 0.1 + 0.9 * t), ("climb_down", 0.1 + 0.9 * t)):
         block = slab("block", skill, draw[skill][0])
         used = block[:, 2] > -10
-        assert 0.7 < used.mean() < 0.9
+        assert 0.7 < used.mean() < 0.9 and (used == ~draw[skill][2]).all()
         np.testing.assert_allclose(block[used, 2] + 1.0, height, atol=1e-5)
     table = slab("table", "crouch", draw["crouch"][0])
     table = table[table[:, 2] > -10]
@@ -118,6 +120,7 @@ def test_levels_are_what_the_table_says(level):
     gap = far[:, 0] - near[:, 0] - 3.0
     np.testing.assert_allclose(np.unique(gap.round(4)), np.unique(np.round([0, 0.1 + 0.9 * t], 4)), atol=1e-3)
     np.testing.assert_allclose(near[:, 2] + 0.5, 0.0, atol=1e-6)
+    assert ((gap < 1e-3) == draw["jump"][2]).all() and not draw["walk"][2].any()
     tops = np.stack([slab(f"plank{i}", "walk", draw["walk"][0])[:, 2] for i in range(8)], 1) + 1.2
     rise = np.diff(tops, axis=1)
     stairs = (np.ptp(rise, axis=1) < 1e-4) & (tops[:, 0] > -10)
@@ -194,9 +197,11 @@ def climb_up(jitted):
     return env, jax.jit(env.reset)(jax.random.key(0))
 
 
-def rule(env, state, level, distance, far, terminated, best=0):
-    """The next curriculum of an environment at a level whose episode ends at a distance."""
-    task = state.task.replace(level=jnp.int32(level), best=jnp.int32(best), far=jnp.float32(far))
+def rule(env, state, level, distance, far, terminated, best=0, rough=False):
+    """The next level and best of an environment at a level whose episode ends at a distance."""
+    task = state.task.replace(
+        level=jnp.int32(level), best=jnp.int32(best), far=jnp.float32(far), rough=jnp.array(rough)
+    )
     motion = env.motion(state.physics)
     goal = motion.base_pos + jnp.array([distance, 0.0, 0.0])
     ended = jnp.asarray(terminated)
@@ -206,13 +211,20 @@ def rule(env, state, level, distance, far, terminated, best=0):
 
 def test_promotion_and_demotion(climb_up):
     env, state = climb_up
-    assert rule(env, state, 3, 0.3, 2.0, False) == (4, 4)  # there in time
-    assert rule(env, state, 3, 0.8, 2.0, False) == (3, 3)  # over half way
+    assert rule(env, state, 3, 0.3, 2.0, False) == (4, 3)  # there in time: level 3 is solved
+    assert rule(env, state, 3, 0.8, 2.0, False) == (3, 0)  # over half way
     assert rule(env, state, 3, 1.2, 2.0, False, best=7) == (2, 7)  # not half way; the best stays
     assert rule(env, state, 3, 0.3, 2.0, True)[0] == 2  # fell, although there
     assert rule(env, state, 0, 1.9, 2.0, False) == (0, 0)
-    level, best = rule(env, state, 9, 0.1, 2.0, False, best=9)
+    level, best = rule(env, state, 9, 0.1, 2.0, False, best=8)
     assert 0 <= level <= 9 and best == 9
+
+
+def test_rough_ground_moves_no_level(climb_up):
+    """Neither success nor failure there says anything about the obstacle."""
+    env, state = climb_up
+    assert rule(env, state, 3, 0.3, 2.0, False, best=1, rough=True) == (3, 1)
+    assert rule(env, state, 3, 0.3, 2.0, True, best=1, rough=True) == (3, 1)
 
 
 def test_fixed_level_stays():
@@ -223,14 +235,13 @@ def test_fixed_level_stays():
 
 def test_level_survives_the_reset_and_moves_the_box(jitted):
     """An environment that ends its episode in failure starts again one level lower, its box lower too."""
-    env = jitted("anymal_climb_up").env
+    env = jitted("anymal_climb_up", rough=0.0).env
     state = jax.jit(lambda k: env.reset(k, curriculum=env.at_level(5)))(jax.random.key(3))
     upside_down = state.physics.qpos.at[3:7].set(jnp.array([0.0, 1, 0, 0])).at[2].set(1.5)
     state = state.replace(physics=state.physics.replace(qpos=upside_down))
     after = jax.jit(env.step)(state, jnp.zeros(12))
-    assert bool(after.terminated) and int(after.task.level) == 4 and int(after.task.best) == 5
-    tops = [float(after.physics.mocap_pos[0, 2]) + 1.0]
-    assert tops[0] == pytest.approx(0.1 + 0.9 * 4 / 9, abs=1e-4) or tops[0] < -40  # a box, or rough tiles
+    assert bool(after.terminated) and int(after.task.level) == 4 and int(after.task.best) == 0
+    assert float(after.physics.mocap_pos[0, 2]) + 1.0 == pytest.approx(0.1 + 0.9 * 4 / 9, abs=1e-4)
 
 
 def test_time_limit_is_an_end_without_bootstrap():
@@ -416,10 +427,10 @@ def test_engines_agree_on_a_slab(jitted):
     """A robot that stands on the box it will climb down from: both engines hold it up at the same place."""
     heights = {}
     for engine in ("c", "mjx"):
-        task = jitted("anymal_climb_down", engine, level=4, noise=0.0, spawn_velocity=0.0, push_velocity=0.0)
+        task = jitted("anymal_climb_down", engine, level=4, rough=0.0, noise=0.0, spawn_velocity=0.0, push_velocity=0.0)
         state = task.start(4, seed=3)
         for _ in range(10):
             state = task.hold(state)
         heights[engine] = np.asarray(state.physics.qpos[:, :3])
     np.testing.assert_allclose(heights["c"], heights["mjx"], atol=0.02)
-    assert (heights["c"][:, 2] > 0.8).any()  # on the box of 0.5 m, but for the rough-ground episodes
+    assert (heights["c"][:, 2] > 0.8).all()  # on the box of 0.5 m
