@@ -744,8 +744,8 @@ def fill(args, chunk, state, rows, out, files):
                 records.save_rows(out / "metrics.csv", rows)
             reporter.show(row, args.log_every * args.num_envs * args.num_steps / (now - last))
             last = now
-            if not np.isfinite(row["disagreement"]):
-                raise records.UserError(f"disagreement is not finite after iteration {row['iteration']}; lower --lr")
+            if not records.finite((state.params, state.ensemble)):
+                raise records.UserError(f"weights are not finite after iteration {state.iteration}; lower --lr")
             if now - saved >= 60 * args.save_minutes or reporter.stopped:
                 save(out, files, state, rows)
                 saved = now

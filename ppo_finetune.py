@@ -923,7 +923,7 @@ def keep(seeds, outs, before, states, metrics, rows, seconds):
         rows[i].append(records.make_row(args, int(states.iteration[i]), seconds, own))
         if out:
             records.save_rows(out / "metrics.csv", rows[i])
-        if not all(jnp.isfinite(x).all() for x in jax.tree.leaves(params)):
+        if not records.finite(params):
             save_states(outs, before, [own[: len(rows[0]) - 1] for own in rows])
             raise records.UserError(
                 f"weights are not finite after iteration {states.iteration[i]}; lower --lr. To see what happened: "

@@ -125,7 +125,8 @@ def refuse_overwrite(out, force):
 def start_run(args, config, folder, force):
     """Create the run folder with args.json in it and return it. Refuses to overwrite a run unless `force`.
 
-    args and config (the task's) are dataclasses; both are recorded, with versions, commit and device.
+    args and config (the task's) are dataclasses; both are recorded, with versions, commit and device. What an old run
+    left goes, so that a new one that is stopped early cannot be taken for it.
     """
     out = Path(folder)
     refuse_overwrite(out, force)
@@ -134,7 +135,7 @@ def start_run(args, config, folder, force):
     record = dataclasses.asdict(args) | {"config": dataclasses.asdict(config), "versions": versions()}
     try:
         out.mkdir(parents=True, exist_ok=True)
-        for old in (out / "metrics.csv", out / STATE, *out.glob("events.out.tfevents.*")):
+        for old in (*(out / name for name in (STATE, *RESULTS)), *out.glob("events.out.tfevents.*")):
             old.unlink(missing_ok=True)
         replace_text(out / "args.json", json.dumps(record, indent=1) + "\n")
     except OSError as error:
@@ -171,6 +172,20 @@ def load(path, kind):
 
 
 STATE = "state.msgpack"  # in a run folder: what --resume goes on from
+RESULTS = (
+    "metrics.csv",
+    "policy.msgpack",
+    "pidm.msgpack",
+    "eval.json",
+    "validation.json",
+    "rollout.png",
+    "rollout.gif",
+)
+
+
+def finite(tree):
+    """Whether every number of a tree of arrays is."""
+    return all(jnp.isfinite(leaf).all() for leaf in jax.tree.leaves(tree))
 
 
 def save_state(out, state, rows):

@@ -73,7 +73,7 @@ def find(folder, iterations, most):
             many = f"{bad[last].sum()} of {args.num_envs}"
             return print(f"iteration {now}, step {last}: {many} environments went wrong; wrote {path}")
         state = advance(state)
-        if not all(jnp.isfinite(x).all() for x in jax.tree.leaves(state.params)):
+        if not records.finite(state.params):
             return print(f"iteration {now}: every robot did well, but the update made weights that are not finite")
     return print(f"nothing went wrong in {iterations} iterations from {now + 1 - iterations} on; see --iterations")
 

@@ -270,6 +270,13 @@ def test_data_are_not_overwritten(collected, refused):
     assert (collected[0] / "x.npy").read_bytes() == before
 
 
+def test_weights_that_are_not_finite_stop_the_collection(tmp_path, refused):
+    """Before they are saved, and before the folder can be taken for a dataset."""
+    out = tmp_path / "run"
+    refused(script.main, dataclasses.replace(SMOKE, run_dir=str(out), lr=1e11), "weights are not finite", "--lr")
+    assert not (out / "meta.json").exists() and not (out / records.STATE).exists()
+
+
 def test_full_disk_is_one_line_and_leaves_no_arrays(tmp_path, refused, monkeypatch):
     def full(*_):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))

@@ -172,6 +172,17 @@ def test_a_run_is_not_overwritten(trained):
     assert "--force" in process.stderr and (trained[0] / "metrics.csv").read_bytes() == before
 
 
+def test_force_takes_the_old_results_away(tmp_path):
+    """A run that is stopped before its first row must not leave its arguments beside another's weights."""
+    for name in (*records.RESULTS, records.STATE, "mine.txt"):
+        (tmp_path / name).write_text("old")
+    with pytest.raises(records.UserError, match="--force"):
+        records.start_run(SMOKE, SMOKE, tmp_path, force=False)
+    assert len(list(tmp_path.iterdir())) == len(records.RESULTS) + 2
+    records.start_run(SMOKE, SMOKE, tmp_path, force=True)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["args.json", "mine.txt"]
+
+
 def test_unknown_preset_lists_the_right_ones():
     process = run("--preset", "huge")
     assert process.returncode == 2 and "smoke" in process.stderr and "Traceback" not in process.stderr
