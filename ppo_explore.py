@@ -41,7 +41,7 @@ class Args:
     robot: str = "go1"  # a name in envs.EXPLORE
     preset: Literal["smoke", "cpu", "gpu"] = "cpu"  # scale: smoke 4 environments, cpu 256, gpu 4096
     seed: int = 0  # the only source of randomness
-    engine: str = "auto"  # physics: c (CPU threads), mjx (accelerators), auto
+    engine: str = "auto"  # physics: c (CPU threads), mjx (accelerators), warp (NVIDIA), auto
     run_dir: str | None = None  # None: runs/explore/<robot>/seed<seed>
     force: bool = False  # overwrite the data in that folder
     resume: str | None = None  # a run folder: go on where it stopped; all other arguments are those of that run

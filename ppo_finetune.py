@@ -45,7 +45,7 @@ class Args:
     preset: Literal["smoke", "cpu", "gpu"] = "cpu"  # scale: smoke 4 environments, cpu 256, gpu 4096
     seed: int = 0  # the only source of randomness
     num_seeds: int = 1  # trainings in one program, with seed, seed + 1, ...; each with a run folder of its own
-    engine: str = "auto"  # physics: c (CPU threads), mjx (accelerators), auto
+    engine: str = "auto"  # physics: c (CPU threads), mjx (accelerators), warp (NVIDIA), auto
     run_dir: str | None = None  # None: runs/<task>/<method>/seed<seed>
     force: bool = False  # overwrite the run in that folder
     resume: str | None = None  # a run folder: go on where it stopped; all other arguments are those of that run
@@ -67,6 +67,7 @@ class Args:
     # --- Network (tasks' own tables) ---
     hidden: tuple[int, ...] | None = None  # widths of the MLP's hidden layers
     intention: tuple[int, ...] | None = None  # of the PIDM's intention encoder but the last; None: as in pretraining
+    # Deviation: rsl_rl learns the std itself, we its log.
     init_std: float | None = None  # initial action std, in action units
     # Deviation: rsl_rl's fresh layers are as PyTorch makes them; with orthogonal ones Go1 learns faster, see README.
     fresh: Literal["orthogonal", "pytorch"] = "orthogonal"  # first weights of all that is not loaded

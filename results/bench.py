@@ -301,7 +301,7 @@ def main(args):
 
 def write_page(out):
     """README.md: the tables of every machine."""
-    page = ["# Speed", "", "Made by `python results/bench.py`; what the rows mean stands in it."]
+    page = ["# Speed", "", "Made by `python results/bench.py`; what the rows mean stands in [bench.py](../bench.py)."]
     for path in sorted(out.glob("*.json")):
         for part, found in json.loads(path.read_text()).items():
             facts = ", ".join(f"{name} {value}" for name, value in found["machine"].items())
