@@ -142,7 +142,7 @@ def effective_rank(x):
 
 
 def first_features(task, **choice):
-    """The actor's backbone output over the first rollout of a task: root mean square and effective rank."""
+    """The actor's backbone output over the first rollout of a task: its size and rank; and the mean action's size."""
     env = ppo_finetune.envs.make(task, "c")
     args = ppo_finetune.merge(ppo_finetune.Args(task=task, network="pidm", **choice), env.config.ppo)
     net = ppo_finetune.make_net(args, env)
@@ -152,11 +152,14 @@ def first_features(task, **choice):
     def features(state):
         _, roll, _ = ppo_finetune.rollout(args, env, net, state.params, state.env, state.key)
         _, seen = net.apply(state.params, roll.inputs, capture_intermediates=True, mutable=["intermediates"])
-        return ppo_finetune.nn.elu(seen["intermediates"]["actor"]["backbone"]["__call__"][0])
+        return ppo_finetune.nn.elu(seen["intermediates"]["actor"]["backbone"]["__call__"][0]), roll.mean
 
-    z = np.asarray(features(state))
-    z = z.reshape(-1, z.shape[-1])
-    return {"root mean square": float(np.sqrt((z**2).mean())), "effective rank": effective_rank(z)}
+    z, action = map(np.asarray, features(state))
+    return {
+        "root mean square": float(np.sqrt((z**2).mean())),
+        "effective rank": effective_rank(z.reshape(-1, z.shape[-1])),
+        "mean action's root mean square": float(np.sqrt((action**2).mean())),
+    }
 
 
 def compare_features(robot, task):
@@ -164,6 +167,7 @@ def compare_features(robot, task):
     loaded = {"pretrained": str(ROOT / f"assets/pidm/{robot}.msgpack")}
     choices = {"fresh, orthogonal": {}, "fresh, as PyTorch's": {"fresh": "pytorch"}}
     choices |= {"loaded": loaded, "loaded and shuffled": loaded | {"init": "shuffled"}}
+    choices |= {"loaded, the rest as PyTorch's": loaded | {"fresh": "pytorch"}}
     found = {name: first_features(task, **choice) for name, choice in choices.items()}
     return {f"features in {task}, {what}, {name}": x for name, facts in found.items() for what, x in facts.items()}
 
@@ -273,7 +277,8 @@ last row of metrics.csv is on the collection that they were trained on. Joint sp
 each pair of neighbouring joints of a limb that 20,000 samples visit. Disagreement is that of an ensemble trained on the
 first tenth of the collection, there and on the last tenth. The recorded policy is that of results/tasks, with its
 noise: how well the PIDM knows a gait that it never saw. Features are the outputs of the actor's backbone over the first
-rollout of a task; their effective rank (Roy and Vetterli 2007) is the number of directions, of 64, that they fill.
+rollout of a task; their effective rank (Roy and Vetterli 2007) is the number of directions, of 64, that they fill. The
+study's pretrained arm is "loaded, the rest as PyTorch's".
 
 """
 
