@@ -745,7 +745,9 @@ def fill(args, chunk, state, rows, out, files):
             reporter.show(row, args.log_every * args.num_envs * args.num_steps / (now - last))
             last = now
             if not records.finite((state.params, state.ensemble)):
-                raise records.UserError(f"weights are not finite after iteration {state.iteration}; lower --lr")
+                raise records.UserError(
+                    f"weights are not finite after iteration {state.iteration}; lower --lr or --ensemble-lr"
+                )
             if now - saved >= 60 * args.save_minutes or reporter.stopped:
                 save(out, files, state, rows)
                 saved = now

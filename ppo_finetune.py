@@ -685,7 +685,7 @@ def evaluate(env, net, params, num_envs, level=None):
     for name, v in metrics.items():
         if name.startswith("episode_"):
             result[name] = (v * ended).sum() / ended.sum()
-        elif "/" not in name:  # not the parts of a total
+        elif "/" not in name and name != "progress":  # not the parts of a total, nor what is of a whole training
             result[name] = (v * alive).sum() / alive.sum()
     result["falls"] = fell.any(0).mean()
     return result, jax.tree.map(lambda x: x[0], env_state.physics), qpos
@@ -746,7 +746,7 @@ def watch_live(args):
     """--eval POLICY --viewer or --web: a person commands, pushes and picks the level; see envs/watch.py."""
     from envs import watch
 
-    env = make_env(args)
+    env = make_env(args, **envs.TASKS[args.task][0].EVALUATION)
     if "time_left" not in env.OBS:
         env = make_env(args, episode_seconds=3600.0)  # no need to start again after 20 s
     net, params = load_policy(args, env)

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from envs import rewards, terrain
-from envs.base import BODY, Config, Course, Env, axis_angle, inverse, rotate, uniform, wrap
+from envs.base import BODY, Config, Course, Env, axis_angle, inverse, rotate, select, uniform, wrap
 from envs.courses import SKILLS, all_slabs, draw
 
 LEVELS = 10
@@ -114,7 +114,7 @@ class Parkour(Env):
             "level": jnp.where(level >= LEVELS, anywhere, jnp.maximum(level, 0)),
             "best": jnp.where(success, jnp.maximum(task.best, task.level), task.best),
         }
-        return jax.tree.map(lambda here, there: jnp.where(task.rough, here, there), stay, moved)
+        return select(task.rough, stay, moved)
 
     def succeeded(self, task, motion, truncated):
         """Whether the time is up and the robot is where it should be."""

@@ -118,15 +118,15 @@ def start_runs(each, config, force):
 
 def refuse_overwrite(out, force):
     """UserError if the folder holds a run, unless `force`."""
-    if (out / "metrics.csv").exists() and not force:
+    if any((out / name).exists() for name in RESULTS) and not force:
         raise UserError(f"{out} holds a run already; pass --force to overwrite it or --run-dir for another folder")
 
 
 def start_run(args, config, folder, force):
     """Create the run folder with args.json in it and return it. Refuses to overwrite a run unless `force`.
 
-    args and config (the task's) are dataclasses; both are recorded, with versions, commit and device. What an old run
-    left goes, so that a new one that is stopped early cannot be taken for it.
+    args and config (the task's) are dataclasses; both are recorded, with versions, commit and device. Weights
+    and measures of an old run go, so that a new one that is stopped early cannot be taken for it.
     """
     out = Path(folder)
     refuse_overwrite(out, force)

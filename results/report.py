@@ -321,8 +321,11 @@ def spread(values):
 
 
 def counts(values):
-    """Mean of iteration counts, NaN where a level was not reached."""
-    return "not reached" if np.isnan(values).all() else f"{np.nanmean(values):.0f}"
+    """Mean of iteration counts, NaN where a level was not reached, and how many did where not all."""
+    reached = np.isfinite(values)
+    if not reached.any():
+        return "not reached"
+    return f"{np.nanmean(values):.0f}" + ("" if reached.all() else f" ({reached.sum()} of {len(values)})")
 
 
 def pidm_table():
@@ -453,10 +456,12 @@ random. Final performance is the mean indicator of the last 5% of a training (ep
 parkour: progress of the curriculum), iterations those to 90% of PIDM random's final performance; less is better.
 Brackets are 95% bootstrap intervals over seeds; with few seeds they are rough, beside a single one they hold the spread
 of PIDM random alone; where PIDM random has one seed as well there is none, and that task adds no width to the mean's.
-Where the mean says "at least", a run that never got to 90% counts as if it had with its last iteration.
+Where the mean says "at least", a run that never got to 90% counts as if it had got there in its last iteration. A task
+in which a run of PIDM random did not get there is left out of the mean.
 """
 BEYOND = """`PIDM shuffled` has the pretrained weights permuted within each layer: the same numbers, no knowledge. Its
-features are 56 to 78% as large as the loaded ones and fill half as many directions again ([features](pidm/README.md)).
+features are 56 to 78% as large as the loaded ones and fill half as many directions again ([features](pidm/README.md),
+with orthogonal weights around both).
 `orthogonal` has orthogonal first weights, our default, where the others have PyTorch's, as rsl_rl, a fork
 of which the paper used.
 `history encoder only` leaves the backbone fresh; `scaled` halves the loaded backbone's output; `slow start` lets

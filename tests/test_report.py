@@ -43,6 +43,12 @@ def test_a_single_seed_has_no_std():
     assert report.spread([9.0, 11.0]) == "10 ± 1"
 
 
+def test_counts_say_how_many_got_there():
+    assert report.counts([100.0, 300.0]) == "200"
+    assert report.counts([100.0, np.nan, 300.0]) == "200 (2 of 3)"
+    assert report.counts([np.nan]) == "not reached"
+
+
 def test_what_was_not_run_or_not_reached_is_said():
     runs = {"pidm_random": [curve([10.0] * 10)], "mlp": [curve([10.0] * 10), curve([1.0] * 10)]}
     assert report.cell(runs, "mlp", "to 90%") == "not reached by 1 of 2"

@@ -183,6 +183,14 @@ def test_force_takes_the_old_results_away(tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["args.json", "mine.txt"]
 
 
+@pytest.mark.parametrize("name", records.RESULTS)
+def test_any_result_makes_a_folder_a_run(name, tmp_path):
+    """Weights alone, say of somebody else's training, are not overwritten either."""
+    (tmp_path / name).write_text("old")
+    with pytest.raises(records.UserError, match="--force"):
+        records.start_run(SMOKE, SMOKE, tmp_path, force=False)
+
+
 def test_unknown_preset_lists_the_right_ones():
     process = run("--preset", "huge")
     assert process.returncode == 2 and "smoke" in process.stderr and "Traceback" not in process.stderr
