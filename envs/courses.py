@@ -112,7 +112,7 @@ def walk(key, t):
 
 @dataclass(frozen=True)
 class Skill:
-    """Slabs of a scene, where a level puts them, and the height of the floor below."""
+    """Slabs of an obstacle, where a level puts them, and the height of the floor below."""
 
     slabs: tuple[Slab, ...]
     obstacle: Callable  # (key, t) -> poses, goal
@@ -134,8 +134,8 @@ def all_slabs(skill):
     return (*skill.slabs, *TILES) if skill.plain else skill.slabs
 
 
-def draw(skill, key, t, share):
-    """Poses of all_slabs, the goal, and whether this is one of the `share` of episodes without the obstacle."""
+def draw_course(skill, key, t, share):
+    """Poses (M, 4) of all_slabs, goal (3,) [m], and whether () this is one of the `share` without the obstacle."""
     if not skill.plain:
         return *skill.obstacle(key, t), jnp.asarray(False)
     k_share, k_obstacle, k_rough = jax.random.split(key, 3)

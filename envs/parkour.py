@@ -14,7 +14,7 @@ import numpy as np
 
 from envs import rewards, terrain
 from envs.base import BODY, Config, Course, Env, axis_angle, inverse, rotate, select, uniform, wrap
-from envs.courses import SKILLS, all_slabs, draw
+from envs.courses import SKILLS, all_slabs, draw_course
 
 LEVELS = 10
 HEIGHT_GRID = np.stack(np.meshgrid(np.linspace(-1, 1, 21), np.linspace(-0.5, 0.5, 11), indexing="ij"), -1)  # [m]
@@ -124,7 +124,8 @@ class Parkour(Env):
         return jax.random.randint(key, (), 0, round(self.config.random_seconds / self.dt) + 1)
 
     def course(self, key, curriculum):
-        poses, goal, rough = draw(self.skill, key, curriculum["level"] / (LEVELS - 1), self.config.rough)
+        t = curriculum["level"] / (LEVELS - 1)
+        poses, goal, rough = draw_course(self.skill, key, t, self.config.rough)
         quat = axis_angle(jnp.array([0.0, 1, 0]), poses[:, 3])
         return ParkourCourse(poses[:, :3], quat, curriculum, goal, rough)
 

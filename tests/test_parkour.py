@@ -106,7 +106,8 @@ def test_levels_are_what_the_table_says(level):
     t = level / 9
     keys = jax.random.split(jax.random.key(level), 300)
     draw = {
-        name: jax.vmap(lambda k, s=skill: courses.draw(s, k, t, 0.2))(keys) for name, skill in courses.SKILLS.items()
+        name: jax.vmap(lambda k, s=skill: courses.draw_course(s, k, t, 0.2))(keys)
+        for name, skill in courses.SKILLS.items()
     }
     for skill, height in (("climb_up", 0.1 + 0.9 * t), ("climb_down", 0.1 + 0.9 * t)):
         block = slab("block", skill, draw[skill][0])

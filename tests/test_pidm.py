@@ -293,17 +293,19 @@ def test_first_weights_are_as_pytorch_makes_them(network, jitted):
                 assert not bias.any()
 
 
+@pytest.mark.parametrize("preset", ["cpu", "gpu"])
 @pytest.mark.parametrize("task", envs.TASKS)
-def test_parameter_ratio(task):
-    """A PIDM has about four times the parameters of a blind task's MLP (paper Sec. V-A), of parkour's twice as many."""
+def test_parameter_ratio(task, preset):
+    """A PIDM has about four times the parameters of a blind task's MLP (paper Sec. V-A), fewer in parkour (README)."""
     env = envs.make(task, "c")
-    args = finetune.merge(finetune.Args(task=task), env.config.ppo)
+    args = finetune.merge(finetune.Args(task=task, preset=preset), env.config.ppo)
     counts = []
     for network in ("mlp", "pidm"):
         net = finetune.make_net(dataclasses.replace(args, network=network), env)
         shapes = jax.eval_shape(net.init, jax.random.key(0), finetune.zero_inputs(env, net))["params"]
         counts.append(sum(leaf.size for leaf in jax.tree.leaves(shapes)))
-    low, high = (1.9, 2.2) if "intention" in env.config.ppo else (3.5, 4.5)
+    parkour = {"cpu": (1.9, 2.2), "gpu": (1.3, 1.5)}[preset]
+    low, high = parkour if "intention" in env.config.ppo else (3.5, 4.5)
     assert low < counts[1] / counts[0] < high, counts
 
 
