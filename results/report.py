@@ -99,12 +99,14 @@ def load_run(folder):
         columns = {name: np.array([float(row[name]) for row in rows]) for name in rows[0]}
         complete = bool(columns["env_steps"][-1] >= float(record["total_steps"]))
         keys = ("num_envs", "num_steps", "total_steps", "lr", "num_epochs", "mirror_coef", "config")
+        success = {name: one["episode_success"] for name, one in result.items() if name.startswith("level ")}
         run = {
             "columns": columns,
             "iteration": columns["iteration"],
             "indicator": columns["progress" if "progress" in columns else "episode_return"],
             "errors": dict(result.get("task", {})),
-            "settings": {key: record[key] for key in keys},
+            "success": list(success.values()),
+            "settings": {key: record[key] for key in keys} | {"levels": list(success)},
             "seed": record["seed"],
             "versions": record["versions"],
         }
@@ -304,6 +306,9 @@ def details(runs):
         row = {"method": METHODS[method]}
         for name in sorted(mine[0]["errors"].keys() - {"diverged"}):
             row[f"mean action: {name}"] = f"{np.mean([run['errors'][name] for run in mine]):.3g}"
+        if mine[0]["success"]:
+            by_level = 100 * np.mean([run["success"] for run in mine], axis=0)
+            row["mean action: success by level [%]"] = " ".join(f"{share:.0f}" for share in by_level)
         shrink = [np.log(r["columns"]["action_std"][-1] / r["columns"]["action_std"][0]) for r in mine]
         steps = [r["columns"]["lr"].sum() for r in mine]
         row |= {

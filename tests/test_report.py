@@ -130,6 +130,20 @@ def test_bad_runs_are_left_out_with_a_warning(study, capsys):
     assert "left out" in capsys.readouterr().err
 
 
+def test_success_by_level_is_a_mean_over_runs_of_the_same_levels(study, capsys):
+    folder, args = study
+    result = {f"level {i}": {"episode_success": share} for i, share in enumerate((1.0, 0.5))}
+    for seed, last in ((0, 0.5), (1, 0.0)):
+        target = folder / f"mlp/seed{seed}"
+        shutil.copytree(folder / "pidm_random/seed0", target, dirs_exist_ok=True)
+        (target / "args.json").write_text(json.dumps(args | {"seed": seed}))
+        result["level 1"]["episode_success"] = last
+        (target / "eval.json").write_text(json.dumps(result))
+    runs = report.load_task(folder)
+    assert list(runs) == ["mlp"] and "other settings" in capsys.readouterr().err  # PIDM random was run on no level
+    assert "success by level [%]" in report.details(runs)[-3] and "| 100 25 |" in report.details(runs)[-1]
+
+
 def test_without_a_baseline_there_is_no_level_to_reach(study):
     runs = report.load_task(study[0])
     assert "no PIDM random" not in report.details(runs)[2]
