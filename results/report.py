@@ -523,7 +523,7 @@ def with_table(text, study):
     ran = [task for task in TASKS if "pidm_random" in study.get(task, {})]
     missing = ", ".join(f"`{task}`" for task in TASKS if task not in ran)
     lines = ["", *table_1(study, ran), ""] if ran else [""]
-    lines += [f"Not run yet: {missing}.", ""] if missing else []
+    lines += [f"Not all methods run yet: {missing}.", ""] if missing else []
     before, rest = text.split(BEGIN)
     return "\n".join([before + BEGIN, *lines, END + rest.split(END)[1]])
 
