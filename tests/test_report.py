@@ -59,26 +59,29 @@ def test_what_was_not_run_or_not_reached_is_said():
     assert report.cell(runs, "mlp", "to 90%") == "not reached by 1 of 2 PIDM random"
 
 
-def test_mean_over_tasks_is_of_those_that_were_run():
-    """Two tasks at +10 and -30 percent; the third lacks its baseline."""
+def test_mean_over_tasks_is_of_those_with_several_seeds():
+    """Two tasks at +10 and -30 percent; one has a single seed of each, one a single seed of one, one no baseline."""
     ten = curve([10.0] * 10)
     study = {
-        "go1_loco": {"pidm_random": [ten], "mlp": [curve([11.0] * 10)]},
-        "g1_loco": {"pidm_random": [ten], "mlp": [curve([7.0] * 10)]},
-        "anymal_loco": {"mlp": [ten]},
+        "go1_loco": {"pidm_random": [ten, ten], "mlp": [curve([11.0] * 10)] * 2},
+        "g1_loco": {"pidm_random": [ten, ten], "mlp": [curve([7.0] * 10)] * 2},
+        "anymal_climb_up": {"pidm_random": [ten], "mlp": [curve([99.0] * 10)]},
+        "anymal_crouch": {"pidm_random": [ten, ten], "mlp": [curve([99.0] * 10)]},
+        "anymal_loco": {"mlp": [ten, ten]},
     }
     line = report.table_1(study)[-1].split(" | ")
     assert line[2:4] == ["-10.0", "+0.2"] and line[4:6] == ["not run", ""]
+    assert report.cell(study["anymal_climb_up"], "mlp", "final") == "+890.0"
 
 
 def test_mean_counts_a_run_that_never_got_there_by_its_length():
-    """PIDM random is there at row 5, as is one MLP; the other is not at row 10: +0 and at least +100."""
+    """PIDM random is there at row 5, as are the MLPs of one task; the other's are not at row 10: +0, at least +100."""
     ten = curve([10.0] * 10)
     study = {
-        "go1_loco": {"pidm_random": [ten], "mlp": [ten]},
-        "g1_loco": {"pidm_random": [ten], "mlp": [curve([1.0] * 10)]},
+        "go1_loco": {"pidm_random": [ten, ten], "mlp": [ten, ten]},
+        "g1_loco": {"pidm_random": [ten, ten], "mlp": [curve([1.0] * 10)] * 2},
     }
-    assert report.cell(study["g1_loco"], "mlp", "to 90%") == "not reached by 1 of 1"
+    assert report.cell(study["g1_loco"], "mlp", "to 90%") == "not reached by 2 of 2"
     text, tasks = report.mean_over_tasks(study, "mlp", "to 90%")
     assert text == "at least +50.0" and list(tasks) == ["go1_loco", "g1_loco"]
     assert report.mean_over_tasks({"go1_loco": study["go1_loco"]}, "mlp", "to 90%")[0] == "+0.0"
