@@ -58,7 +58,7 @@ ABLATIONS = ("pidm_actor", "pidm_critic", "pidm_7k", "pidm_70k", "pidm_700k")
 GRID = {  # task -> methods; blind tasks first
     **dict.fromkeys(("go1_loco", "anymal_loco"), (*TABLE_1, *ORTHOGONAL, "pidm_shuffled")),
     **dict.fromkeys(("anymal_pedipulation", "g1_loco"), (*TABLE_1, "pidm_shuffled")),
-    **dict.fromkeys(("anymal_climb_up", "anymal_climb_down"), (*TABLE_1, *ABLATIONS)),
+    **dict.fromkeys(("anymal_climb_up", "anymal_climb_down"), (*TABLE_1, *ABLATIONS, "pidm_shuffled")),
     **dict.fromkeys(("anymal_crouch", "anymal_jump", "anymal_parkour_walk"), TABLE_1),
 }
 KEPT = ("args.json", "metrics.csv", "eval.json")

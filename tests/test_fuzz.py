@@ -21,7 +21,7 @@ import pretrain_pidm
 from envs import records
 from results import report
 
-MUTATIONS = 2_000  # of each format
+MUTATIONS = 1_000  # of each format
 JUNK = (None, True, -1, 0, 1e308, 2**63, "", "x" * 99, [], {}, [[]], {"a": {}}, "../../etc", float("nan"))
 
 

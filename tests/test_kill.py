@@ -20,7 +20,7 @@ import ppo_explore
 from envs import records
 
 ROOT = Path(__file__).resolve().parent.parent
-KILLS = int(os.environ.get("KILLS", "3"))
+KILLS = int(os.environ.get("KILLS", "2"))
 ENDLESS = {
     "ppo_explore.py": ("--robot", "go1", "--total-steps", "1000000", "--save-minutes", "0"),
     "pretrain_pidm.py": ("--epochs", "100000"),
