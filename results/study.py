@@ -134,7 +134,7 @@ def show_status(every):
         mark = "." if done is None else "x" if done == 1.0 else f"{100 * done:.0f}%"
         found.setdefault((cell.task, cell.method), []).append(mark)
     for (task, method), marks in found.items():
-        print(f"{task:20}{method:17}{' '.join(marks)}")
+        print(f"{task:20}{method:28}{' '.join(marks)}")
     count = sum(marks.count("x") for marks in found.values())
     print(f"{count} of {sum(map(len, found.values()))} runs")
 
