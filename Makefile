@@ -7,7 +7,7 @@ BIN = .venv/bin
 
 demo: .venv/installed
 	$(BIN)/python ppo_finetune.py --task go1_loco --pretrained assets/pidm/go1.msgpack --run-dir runs/demo --force
-	$(BIN)/python ppo_finetune.py --task go1_loco --eval runs/demo/policy.msgpack
+	$(BIN)/python play.py runs/demo/policy.msgpack
 	$(BIN)/python results/report.py --beside runs/demo
 
 test: .venv/installed

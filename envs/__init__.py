@@ -1,8 +1,12 @@
-"""Robot tasks. `envs.make("go1_loco")` is all a script needs; `envs.TASKS` lists the names, `envs.EXPLORE` robots."""
+"""Robot tasks. `envs.make("go1_loco")` builds one of `envs.TASKS`; `envs.make_explore("go1")` is for exploration."""
 
-from envs import locomotion, parkour, pedipulation
-from envs.base import replace_checked
+import jax
+
+from envs import gl, locomotion, parkour, pedipulation  # noqa: F401, gl comes before all that imports MuJoCo
+from envs.config import replace_checked
 from envs.explore import EXPLORE, Explore
+
+jax.config.update("jax_enable_x64", False)  # physics and networks are in single precision
 
 TASKS = {
     "anymal_loco": (locomotion.AnymalLocomotion, locomotion.ANYMAL_LOCO),
@@ -17,10 +21,10 @@ TASKS = {
 }
 
 
-def make(task, engine="auto", **overrides):
-    """Build a task's environment; overrides replace fields of its config, e.g. make("go1_loco", noise=0.0).
+def make(task, engine="auto", /, **overrides):
+    """Build a task's environment. Overrides replace fields of its config, as in make("go1_loco", noise=0.0).
 
-    ValueError for a task, engine or field that does not exist, naming those that do.
+    ValueError for an unknown task, engine or field, naming those that exist, and for a value of a wrong type.
     """
     if task not in TASKS:
         raise ValueError(f"unknown task {task!r}; choose one of {', '.join(TASKS)}")
@@ -28,8 +32,8 @@ def make(task, engine="auto", **overrides):
     return family(replace_checked(config, overrides), engine)
 
 
-def make_explore(robot, engine="auto", **overrides):
-    """Build a robot's exploration environment (stage 1). ValueError as for `make`."""
+def make_explore(robot, engine="auto", /, **overrides):
+    """Build a robot's exploration environment for stage 1. ValueError as for `make`."""
     if robot not in EXPLORE:
         raise ValueError(f"unknown robot {robot!r}; choose one of {', '.join(EXPLORE)}")
     return Explore(replace_checked(EXPLORE[robot], overrides), engine)

@@ -1,12 +1,9 @@
-"""What every task shares: the State, one control step, noise, history, randomisation, automatic reset, mirrors.
+"""The parts that all tasks share: State, one control step, noise, history, randomisation, reset, mirrors.
 
-`env.reset(key) -> State` and `env.step(state, action) -> State` are pure functions of one environment; scripts vmap
-them. A task family subclasses `Env` and says what it observes, rewards and terminates (see locomotion.py).
-Legend: A joints and actions, F feet, O observation, X proprioception x_t (6 + 2A), K history length.
+`env.reset(key) -> State` and `env.step(state, action) -> State` are pure functions of one environment. Scripts vmap
+them. A task family subclasses `Env`; locomotion.py is the simplest.
+Legend: A joints and actions, F feet, O observation, X proprioception x_t (6 + 2A), K history length, M obstacles.
 """
-
-import dataclasses
-from dataclasses import dataclass
 
 import flax
 import jax
@@ -16,43 +13,13 @@ import numpy as np
 from envs import terrain
 from envs.engine import Physics, make_engine
 from envs.robots import AXIAL, POLAR, ROBOTS
+from envs.rotations import axis_angle, inverse, multiply, rotate, yaw_of
 
-
-@dataclass(frozen=True)
-class Config:
-    """Numbers of a task. Weights are per second, ranges are (low, high)."""
-
-    robot: str
-    weights: dict[str, float]  # reward term -> weight
-    ppo: dict  # the task's own PPO settings; see ppo_finetune.py
-    episode_seconds: float = 20.0
-    physics_dt: float = 0.005  # [s]
-    decimation: int = 4  # physics steps per control step
-    history: int = 5  # K
-    noise: float = 1.0  # multiplies the sensor noise of NOISE
-    reward_floor: float = -0.5  # per second, on the sum of all terms but termination
-    termination_reward: float = 0.0  # once, when an episode ends by failure
-    # end of an episode
-    contact_ends: tuple[str, ...] = ("base",)  # sensors <name>_force whose contact is a failure
-    max_tilt: float = 180.0  # [deg] a steeper trunk is a failure
-    # start of an episode
-    spawn_xy: float = 0.5  # [m] half-width around the origin
-    spawn_yaw: float = np.pi  # [rad] half-width around forward
-    spawn_joints: tuple[float, float] = (1.0, 1.0)  # factor on the default pose
-    spawn_velocity: float = 0.0  # half-width of all six base velocities [m/s, rad/s]
-    # randomisation, drawn once an episode
-    friction: tuple[float, float] = (0.7, 0.7)
-    added_mass: tuple[float, float] = (0.0, 0.0)  # [kg] on the base
-    link_mass: tuple[float, float] = (1.0, 1.0)  # factor on each link's mass and inertia
-    push_velocity: float = 0.0  # [m/s, rad/s] half-width of a sudden change of the base's velocity
-    push_axes: int = 2  # 2: its horizontal velocity, 6: all six components
-    push_seconds: tuple[float, float] = (10.0, 15.0)  # time between pushes
-
-
-# Half-width of uniform sensor noise (tasks of Isaac Lab); commands and the last action are exact.
+# Half-width of uniform sensor noise, as in Isaac Lab's tasks. Commands and the last action are exact.
 NOISE = {"lin_vel": 0.1, "ang_vel": 0.2, "gravity": 0.05, "joint_pos": 0.01, "joint_vel": 1.5}
-PROP = {"ang_vel": "axial", "gravity": "polar", "joint_pos": "joint", "joint_vel": "joint"}  # x_t, in order
-# Observation blocks of the robot itself -> (mirror kind, fixed scale), as `Env.OBS` lists them.
+# Blocks of x_t, in order -> mirror kind.
+PROP = {"ang_vel": "axial", "gravity": "polar", "joint_pos": "joint", "joint_vel": "joint"}
+# Blocks of an observation about the robot itself -> (mirror kind, fixed scale), as in `Env.OBS`.
 BODY = {
     "lin_vel": ("polar", 2.0),
     "ang_vel": ("axial", 0.25),
@@ -61,113 +28,81 @@ BODY = {
     "joint_vel": ("joint", 0.05),
     "action": ("joint", 0.5),
 }
-BLOWN_UP = 1e3  # [m, m/s, rad/s] no sound simulation gets here
+DIVERGED = 1e3  # [m, m/s, rad/s] out of reach of any sound simulation
 
 
 @flax.struct.dataclass
 class State:
-    """One environment. `obs` is what follows an automatic reset, `final_obs` what stood before it."""
+    """One environment after a step. If its episode ended there, an automatic reset has followed.
+
+    `obs` is for the next action, so after a reset it shows the new episode. `final_obs` always shows the old one.
+    """
 
     physics: Physics
     obs: jax.Array  # (O,) scaled, noisy
-    history: dict  # prop (K+1, X) in SI units, action (K, A); oldest first, as the robot logged them
+    history: dict  # prop (K+1, X) in SI units, noisy; action (K, A); oldest first
     reward: jax.Array  # ()
-    terminated: jax.Array  # () bool: failure, nothing follows
-    truncated: jax.Array  # () bool: time limit, V(final_obs) follows
+    terminated: jax.Array  # () bool: failure, the return ends here
+    truncated: jax.Array  # () bool: time limit, the return goes on with V(final_obs)
     final_obs: jax.Array  # (O,)
     final_history: dict
-    action: jax.Array  # (A,) the last one
+    action: jax.Array  # (A,) of the last step, 0 at the start
     clock: jax.Array  # () control steps since the episode began
     push_at: jax.Array  # () clock of the next push
-    episode_return: jax.Array  # () sum of rewards, before the reset
+    episode_return: jax.Array  # () sum of rewards so far
     key: jax.Array
-    task: flax.struct.PyTreeNode  # the task family's own state
+    task: flax.struct.PyTreeNode  # state of the task family
     metrics: dict  # name -> (), of this step
 
 
 @flax.struct.dataclass
 class Course:
-    """What is drawn before an episode starts; a task family may add to it (a goal)."""
+    """Surroundings of an episode, drawn before it starts. A task family may add to them, such as a goal."""
 
     mocap_pos: jax.Array  # (M, 3) [m] obstacles
     mocap_quat: jax.Array  # (M, 4)
-    curriculum: dict  # what an environment keeps from episode to episode (its level)
+    curriculum: dict  # carried from episode to episode, such as a level
 
 
 @flax.struct.dataclass
 class Motion:
-    """True kinematics, computed from qpos and qvel; forces and feet from the engine's sensors."""
+    """True motion: kinematics from qpos and qvel, forces and feet from the engine's sensors."""
 
     lin_vel: jax.Array  # (3,) base velocity, base frame [m/s]
     ang_vel: jax.Array  # (3,) base frame [rad/s]
     gravity: jax.Array  # (3,) unit vector, base frame
-    joint_pos: jax.Array  # (A,) minus the default pose [rad]
-    joint_vel: jax.Array  # (A,)
-    joint_acc: jax.Array  # (A,)
-    base_acc: jax.Array  # (6,) linear (world), angular (base frame)
+    joint_pos: jax.Array  # (A,) relative to the default pose [rad]
+    joint_vel: jax.Array  # (A,) [rad/s]
+    joint_acc: jax.Array  # (A,) [rad/s^2]
+    base_acc: jax.Array  # (6,) linear (world) [m/s^2], angular (base frame) [rad/s^2]
     torque: jax.Array  # (A,) [N m]
     base_pos: jax.Array  # (3,) world [m]
     quat: jax.Array  # (4,) base orientation
     yaw: jax.Array  # () [rad]
-    foot_pos: jax.Array  # (F, 3) world
-    foot_vel: jax.Array  # (F, 3) world
+    foot_pos: jax.Array  # (F, 3) world [m]
+    foot_vel: jax.Array  # (F, 3) world [m/s]
     foot_force: jax.Array  # (F, 3) world [N]
     foot_contact: jax.Array  # (F,) bool, more than 1 N
-    sensors: jax.Array  # (S,) all readings, for the contact forces of other bodies
+    sensors: jax.Array  # (S,) all readings, among them the contact forces of other bodies
     mocap_pos: jax.Array  # (M, 3) obstacles
     mocap_quat: jax.Array  # (M, 4)
 
 
 @flax.struct.dataclass
 class FootClocks:
-    """How long each foot has been in the air or on the ground, for tasks that reward a gait."""
+    """Time of each foot in the air and on the ground, for tasks that reward a gait."""
 
     air_time: jax.Array  # (F,) [s] since the foot left the ground
     contact_time: jax.Array  # (F,) [s] since it landed
     landed_after: jax.Array  # (F,) [s] flight that ended in this step, else 0
 
     def tick(self, contact, dt):
-        """One control step later; contact (F,) bool."""
+        """Advance by one control step; contact (F,) bool."""
         return self.replace(
             landed_after=jnp.where(contact, self.air_time, 0.0),
             air_time=jnp.where(contact, 0.0, self.air_time + dt),
             contact_time=jnp.where(contact, self.contact_time + dt, 0.0),
         )
-
-
-def rotate(quat, vec):
-    """Vector(s) (..., 3) from the body frame of quat (..., 4) wxyz to its parent frame."""
-    w, u = quat[..., :1], quat[..., 1:]
-    return vec + 2 * jnp.cross(u, jnp.cross(u, vec) + w * vec)
-
-
-def multiply(p, q):
-    """Hamilton product of quaternions (..., 4) wxyz."""
-    pw, pv, qw, qv = p[..., :1], p[..., 1:], q[..., :1], q[..., 1:]
-    real = pw * qw - jnp.sum(pv * qv, -1, keepdims=True)
-    return jnp.concatenate([real, pw * qv + qw * pv + jnp.cross(pv, qv)], -1)
-
-
-def axis_angle(axis, angle):
-    """Quaternion (..., 4) of a turn by angle (...) about unit axis (..., 3)."""
-    half = angle[..., None] / 2
-    return jnp.concatenate([jnp.cos(half), jnp.sin(half) * axis], -1)
-
-
-def inverse(quat):
-    """Conjugate of unit quaternions (..., 4)."""
-    return quat * jnp.array([1.0, -1, -1, -1])
-
-
-def yaw_of(quat):
-    """Heading [rad] of a base orientation."""
-    w, x, y, z = quat
-    return jnp.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-
-
-def wrap(angle):
-    """Angle in [-pi, pi)."""
-    return (angle + jnp.pi) % (2 * jnp.pi) - jnp.pi
 
 
 def uniform(key, low, high, shape=()):
@@ -176,20 +111,28 @@ def uniform(key, low, high, shape=()):
 
 
 def select(condition, yes, no):
-    """Leaf-wise where over two pytrees of the same structure."""
+    """Choose between two pytrees of the same structure, leaf by leaf."""
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)
 
 
 class Env:
-    """One robot task. Subclasses define OBS and the methods below `# --- task ---`."""
+    """One robot task. A subclass sets OBS, implements `init_task` and `rewards`, and overrides other hooks as needed.
 
-    # observation block -> (mirror kind, fixed scale); order is the order of the vector
+    Hooks are called in this order. `step` also resets, since every step may end an episode.
+        reset: first_curriculum, course, spawn, place, ground_height, init_task, first_clock, sense, task_inputs,
+            task_metrics
+        step: before_rewards, rewards, failed, task_metrics, next_curriculum, then as in reset without
+            first_curriculum, then push, after_rewards, sense, task_inputs
+    """
+
+    # block of the observation -> (mirror kind, fixed scale), in the order of the vector
     OBS: dict[str, tuple] = {}
-    bootstrap_time_outs = True  # V(final_obs) follows a time limit; not where the policy sees the time left
-    EVALUATION: dict = {}  # config fields for the measures of a trained policy
-    SHOWCASE: dict = {}  # and for its pictures
-    FILM: dict = {}  # which part of an episode they show; see render.film
-    COMMAND: dict[str, tuple] = {}  # what a person who watches may ask for: name -> (low, high); see `tell`
+    LEVELS = 0  # difficulty levels; a task that has some also has `at_level`
+    bootstrap_time_outs = True  # the return goes on after a time limit; False where the policy sees the time left
+    EVALUATION_FIELDS: dict = {}  # config fields for measuring a trained policy
+    SHOWCASE_FIELDS: dict = {}  # config fields for filming one
+    FILM_WINDOW: dict = {}  # the part of the episode to film; arguments of render.film
+    COMMAND_RANGES: dict[str, tuple] = {}  # command of `set_command`: name -> (low, high)
 
     def __init__(self, config, engine="auto"):
         self.config, self.robot = config, ROBOTS[config.robot]
@@ -201,41 +144,41 @@ class Env:
         self.episode_steps = round(config.episode_seconds / self.dt)
         self.action_dim = len(self.robot.joints)
         self.default_pose = jnp.array(self.robot.default_pose)
-        self.sensors = {
+        self.foot_sensors = {
             kind: self.engine.sensor(*(f"{foot}_{kind}" for foot in self.robot.feet))
             for kind in ("pos", "vel", "force")
         }
-        self.ends = self.engine.sensor(*(f"{name}_force" for name in config.contact_ends))
+        self.end_sensors = self.engine.sensor(*(f"{name}_force" for name in config.contact_ends))
         self.legs = self.leg_chains()
         self.mirrors = {mirror: self.mirror_tables(mirror) for mirror in self.robot.mirrors}
-        self.prop_layout = tuple(PROP)  # blocks of x_t
+        self.prop_layout = tuple(PROP)
         self.prop_dim = sum(self.width(kind) for kind in PROP.values())
         self.obs_dim = sum(self.width(kind) for kind, _ in self.OBS.values())
 
-    # --- task ---
+    # --- hooks of a task ---
 
     def scene(self, visual=False):
-        """MjSpec of the robot and its ground."""
+        """MjSpec of the robot and its ground; `visual` adds what only a renderer needs."""
         return terrain.flat_scene(self.robot, visual)
 
     def first_curriculum(self):
-        """What an environment starts its first episode with."""
+        """Curriculum of an environment's first episode."""
         return {}
 
-    def graduate(self, key, task, motion, terminated, truncated):
-        """The curriculum after an episode that ends like this."""
+    def next_curriculum(self, key, task, motion, terminated, truncated):
+        """Curriculum of the next episode, if this one ends in this step."""
         return {}
 
     def first_clock(self, key):
-        """Control steps that have passed when an episode begins; more where episodes have random lengths."""
+        """Clock at the start of an episode. One above 0 shortens the episode."""
         return 0
 
     def course(self, key, curriculum):
-        """Obstacles (and goal) of an episode; none here."""
+        """Course of an episode; here it has no obstacles."""
         return Course(jnp.zeros((0, 3)), jnp.zeros((0, 4)), curriculum)
 
     def init_task(self, key, physics, course):
-        """The task's own state at the start of an episode."""
+        """Task state at the start of an episode."""
         raise NotImplementedError
 
     def ground_height(self, course, xy):
@@ -243,47 +186,51 @@ class Env:
         return jnp.zeros(xy.shape[:-1])
 
     def place(self, key):
-        """Where an episode starts: x, y (2,) [m] and yaw () [rad]."""
+        """Start of an episode: x, y (2,) [m] and yaw () [rad]."""
         k_xy, k_yaw = jax.random.split(key)
         c = self.config
         return uniform(k_xy, -c.spawn_xy, c.spawn_xy, (2,)), uniform(k_yaw, -c.spawn_yaw, c.spawn_yaw)
 
-    def track(self, task, motion):
-        """Bring the task state up to this step's motion, before rewards."""
+    def before_rewards(self, task, motion):
+        """Update the task state with the motion of this step."""
         return task
 
     def rewards(self, task, motion, action, last_action, clock):
-        """Reward terms by name, unweighted, per second; those without a weight are ignored."""
+        """Reward terms by name, unweighted, per second. A term without a weight is ignored."""
         raise NotImplementedError
 
     def failed(self, task, motion):
-        """Whether the episode ends in failure: a body on the ground that should not be, or a fall."""
-        force = jnp.linalg.norm(motion.sensors[self.ends], axis=-1)
+        """True () if the episode ends in failure: a forbidden body touches the ground, or the trunk tilts too far."""
+        force = jnp.linalg.norm(motion.sensors[self.end_sensors], axis=-1)
         return jnp.any(force > 1.0) | (-motion.gravity[2] < jnp.cos(jnp.deg2rad(self.config.max_tilt)))
 
-    def advance(self, key, task, motion, clock):
-        """Task state for the next step (commands), after rewards."""
+    def after_rewards(self, key, task, motion, clock):
+        """Update the task state for the next step: draw commands that are due."""
         return task
 
-    def task_metrics(self, task, motion, truncated):
-        """Numbers to log, by name."""
+    def task_inputs(self, task, motion, clock):
+        """Observation blocks of the task by name, such as a command."""
         return {}
 
-    def told(self, task, wanted):
-        """The task state when a person asks for `wanted`, a number for each name of COMMAND."""
+    def task_metrics(self, task, motion, truncated):
+        """Numbers to log, by name; see `metrics`."""
+        return {}
+
+    def set_command(self, task, command):
+        """Task state with its command replaced; command has a number for each of COMMAND_RANGES."""
         return task
 
-    # --- shared ---
+    # --- reset and step ---
 
     def reset(self, key, clock=None, curriculum=None):
-        """Start an episode. `clock` (steps) lets a first episode start midway, so that time-outs spread out."""
-        k_course, k_clock, k_spawn, k_task, k_sense, k_push, key = jax.random.split(key, 7)
+        """Start an episode. A `clock` above 0 starts it midway, so that a batch's time limits spread out."""
+        k_course, k_clock, k_spawn, k_task, k_noise, k_push, key = jax.random.split(key, 7)
         course = self.course(k_course, self.first_curriculum() if curriculum is None else curriculum)
         physics = self.spawn(k_spawn, course)
         task = self.init_task(k_task, physics, course)
         clock = jnp.asarray(self.first_clock(k_clock) if clock is None else clock, jnp.int32)
         action, motion = jnp.zeros(self.action_dim), self.motion(physics)
-        sensed, prop = self.sense(k_sense, motion, task)
+        sensed, prop = self.sense(k_noise, motion, task)
         obs = self.observe(sensed, task, action, motion, clock)
         history = {
             "prop": jnp.tile(prop, (self.config.history + 1, 1)),
@@ -309,15 +256,15 @@ class Env:
         )
 
     def step(self, state, action):
-        """One control step of 20 ms, with automatic reset. action (A,)."""
-        key, k_sense, k_task, k_push, k_grade, k_reset = jax.random.split(state.key, 6)
+        """Advance by one control step and, if the episode ends there, start the next one. action (A,)."""
+        key, k_noise, k_task, k_push, k_curriculum, k_reset = jax.random.split(state.key, 6)
         physics = self.engine.step(state.physics, self.default_pose + self.robot.action_scale * action)
-        healthy = jnp.all(jnp.abs(physics.qpos) < BLOWN_UP) & jnp.all(jnp.abs(physics.qvel) < BLOWN_UP)  # false for NaN
-        physics = select(healthy, physics, self.standing(state.physics))  # a diverged robot must not poison the batch
+        healthy = jnp.all(jnp.abs(physics.qpos) < DIVERGED) & jnp.all(jnp.abs(physics.qvel) < DIVERGED)  # NaN fails
+        physics = select(healthy, physics, self.standing(state.physics))  # later numbers stay finite
 
-        # rewards and termination, on the true state
+        # rewards and the end of the episode, from the true motion
         motion = self.motion(physics)
-        task = self.track(state.task, motion)
+        task = self.before_rewards(state.task, motion)
         terms = self.rewards(task, motion, action, state.action, state.clock)
         terms = {
             name: jnp.asarray(weight * terms[name] * self.dt, jnp.float32)
@@ -329,13 +276,15 @@ class Env:
         clock = state.clock + 1
         truncated = (clock >= self.episode_steps) & ~terminated
         metrics = self.metrics(physics, healthy, terms, task, motion, truncated)
-        fresh = self.reset(k_reset, curriculum=self.graduate(k_grade, task, motion, terminated, truncated))
+        # Under vmap a branch would compute both sides: every environment is reset, and `select` drops most resets.
+        curriculum = self.next_curriculum(k_curriculum, task, motion, terminated, truncated)
+        next_episode = self.reset(k_reset, curriculum=curriculum)
 
-        # what the robot sees next
+        # the same episode goes on: a push, new commands, the next observation
         physics, push_at = self.push(k_push, physics, clock, state.push_at)
         motion = self.motion(physics)
-        task = self.advance(k_task, task, motion, clock)
-        sensed, prop = self.sense(k_sense, motion, task)
+        task = self.after_rewards(k_task, task, motion, clock)
+        sensed, prop = self.sense(k_noise, motion, task)
         stepped = state.replace(
             physics=physics,
             obs=self.observe(sensed, task, action, motion, clock),
@@ -350,7 +299,8 @@ class Env:
             key=key,
             task=task,
         )
-        return select(terminated | truncated, fresh, stepped).replace(
+        # Only the curriculum survives a reset. The fields replaced here report the step itself, whatever follows it.
+        return select(terminated | truncated, next_episode, stepped).replace(
             reward=reward,
             terminated=terminated,
             truncated=truncated,
@@ -361,16 +311,16 @@ class Env:
         )
 
     def metrics(self, physics, healthy, terms, task, motion, truncated):
-        """What one step reports: weighted reward terms, the task's metrics, faults of the engine, the finished episode.
+        """Metrics of one step: weighted reward terms, the task's metrics, faults of the engine, the finished episode.
 
-        Names that start with `episode_` count where an episode ends, all others in every step.
+        Names that start with `episode_` count only where an episode ends, all others in every step.
         """
         report = {f"reward/{name}": value for name, value in terms.items()} | self.task_metrics(task, motion, truncated)
         faults = {"diverged": ~healthy} | ({"overflow": physics.overflow} if self.engine.bounded else {})
         return report | faults | {"episode_return": jnp.zeros(()), "episode_seconds": jnp.zeros(())}
 
     def spawn(self, key, course):
-        """Physics at the start of an episode: default pose, random place and heading, feet on the ground."""
+        """Physics at the start of an episode: near the default pose, at a random place, feet on the ground."""
         c, m = self.config, self.model
         k_place, k_link, k_joint, k_vel, k_friction, k_mass = jax.random.split(key, 6)
         joints = self.default_pose * uniform(k_joint, *c.spawn_joints, (self.action_dim,))
@@ -390,30 +340,30 @@ class Env:
         return physics.replace(mocap_pos=course.mocap_pos, mocap_quat=course.mocap_quat)
 
     def standing(self, physics):
-        """The same simulation with the robot still, in its default pose: finite whatever it was before."""
+        """Physics with the robot at rest in its default pose, and the surroundings of `physics`."""
         m = self.model
         qpos = jnp.concatenate([jnp.array([0.0, 0, 1, 1, 0, 0, 0]), self.default_pose])
-        fresh = self.engine.initial(qpos, jnp.zeros(m.nv), physics.friction, physics.mass_scale)
-        return fresh.replace(mocap_pos=physics.mocap_pos, mocap_quat=physics.mocap_quat)
+        at_rest = self.engine.initial(qpos, jnp.zeros(m.nv), physics.friction, physics.mass_scale)
+        return at_rest.replace(mocap_pos=physics.mocap_pos, mocap_quat=physics.mocap_quat)
 
     def push_interval(self, key):
         """Control steps until the next push."""
         return jnp.round(uniform(key, *self.config.push_seconds) / self.dt).astype(jnp.int32)
 
     def push(self, key, physics, clock, push_at):
-        """Disturb the robot: change the horizontal base velocity at once, when it is time."""
+        """Disturb the robot: if a push is due, change the base's velocity. Also returns the clock of the next push."""
         k_vel, k_next = jax.random.split(key)
-        now = clock >= push_at
+        due = clock >= push_at
         axes = self.config.push_axes
-        kick = uniform(k_vel, -self.config.push_velocity, self.config.push_velocity, (axes,)) * now
-        push_at = jnp.where(now, clock + self.push_interval(k_next), push_at)
+        kick = uniform(k_vel, -self.config.push_velocity, self.config.push_velocity, (axes,)) * due
+        push_at = jnp.where(due, clock + self.push_interval(k_next), push_at)
         return physics.replace(qvel=physics.qvel.at[:axes].add(kick)), push_at
 
     def motion(self, physics):
-        """True kinematics of a simulation."""
+        """True motion of a simulation."""
         quat = physics.qpos[3:7]
         down = inverse(quat)
-        force = physics.sensors[self.sensors["force"]]
+        force = physics.sensors[self.foot_sensors["force"]]
         return Motion(
             lin_vel=rotate(down, physics.qvel[:3]),
             ang_vel=physics.qvel[3:6],
@@ -426,8 +376,8 @@ class Env:
             base_pos=physics.qpos[:3],
             quat=quat,
             yaw=yaw_of(quat),
-            foot_pos=physics.sensors[self.sensors["pos"]],
-            foot_vel=physics.sensors[self.sensors["vel"]],
+            foot_pos=physics.sensors[self.foot_sensors["pos"]],
+            foot_vel=physics.sensors[self.foot_sensors["vel"]],
             foot_force=force,
             foot_contact=jnp.linalg.norm(force, axis=-1) > 1.0,
             sensors=physics.sensors,
@@ -436,7 +386,7 @@ class Env:
         )
 
     def sense(self, key, motion, task):
-        """Noisy readings by name, and x_t (X,) made of them."""
+        """Noisy readings by name, and x_t (X,), which is made of them."""
         sensed = {}
         for name, key_one in zip(NOISE, jax.random.split(key, len(NOISE)), strict=True):
             true, width = getattr(motion, name), self.config.noise * NOISE[name]
@@ -444,34 +394,46 @@ class Env:
         return sensed, jnp.concatenate([sensed[name] for name in PROP])
 
     def observe(self, sensed, task, action, motion, clock):
-        """Observation (O,): noisy readings, task inputs and last action."""
+        """Observation (O,) from noisy readings, the task's inputs and the last action."""
         return self.pack(sensed | self.task_inputs(task, motion, clock) | {"action": action})
 
     def pack(self, blocks):
-        """Observation (O,) from its blocks by name, in SI units, each times its fixed scale."""
+        """Observation (O,) from its blocks by name in SI units, each times its fixed scale."""
         return jnp.concatenate(
             [jnp.atleast_1d(blocks[name] * jnp.array(scale)) for name, (_, scale) in self.OBS.items()]
         )
 
-    def task_inputs(self, task, motion, clock):
-        """Observation blocks that are the task's own (commands, scans)."""
-        return {}
-
-    def tell(self, state, wanted):
-        """The state in which a person's command holds and the observation says so. wanted (len(COMMAND),)."""
-        task = self.told(state.task, wanted)
-        inputs, obs, start = self.task_inputs(task, self.motion(state.physics), state.clock), state.obs, 0
-        for name, (kind, scale) in self.OBS.items():
-            stop = start + self.width(kind)
-            if name in inputs:
-                obs = obs.at[start:stop].set(inputs[name] * jnp.array(scale))
-            start = stop
+    def with_command(self, state, command):
+        """State in which a person's command (len(COMMAND_RANGES),) holds and the observation shows it."""
+        task, obs = self.set_command(state.task, command), state.obs
+        inputs = self.task_inputs(task, self.motion(state.physics), state.clock)
+        for name, block in inputs.items():
+            obs = obs.at[self.obs_slices()[name]].set(block * jnp.array(self.OBS[name][1]))
         return state.replace(task=task, obs=obs)
+
+    # --- layout of vectors ---
+
+    def width(self, kind):
+        """Length of a block."""
+        return {"joint": self.action_dim, "scalar": 1, "heading": 2}.get(kind, 3)
+
+    def obs_slices(self):
+        """Slice of `obs` of each block, by name."""
+        return self.slices({name: kind for name, (kind, _) in self.OBS.items()})
+
+    def prop_slices(self):
+        """Slice of x_t of each block, by name."""
+        return self.slices(PROP)
+
+    def slices(self, kinds):
+        """Slice of each block, by name, in a vector of blocks of these kinds."""
+        stops = np.cumsum([self.width(kind) for kind in kinds.values()]).tolist()
+        return {name: slice(start, stop) for name, start, stop in zip(kinds, [0, *stops], stops, strict=False)}
 
     # --- kinematics ---
 
     def leg_chains(self):
-        """Per link from the base to the foot: offset (F, 3), turn (F, 4), axis (F, 3), joint (F,); then the site."""
+        """Links from base to foot, each offset (F, 3), turn (F, 4), axis (F, 3), joint (F,); and the sites (F, 3)."""
         m, links = self.model, []
         sites = [m.site(foot) for foot in self.robot.feet]
         body = np.array([site.bodyid[0] for site in sites])
@@ -482,7 +444,7 @@ class Env:
         return links[::-1], np.array([site.pos for site in sites])
 
     def feet_in_base(self, joints):
-        """Foot sites (F, 3) in the base frame at joint angles (A,); exact at reset, where no sensor has been read."""
+        """Foot sites (F, 3) in the base frame at joint angles (A,). At a reset no sensor has been read yet."""
         links, site = self.legs
         pos, quat = jnp.zeros_like(site), jnp.tile(jnp.array([1.0, 0, 0, 0]), (len(site), 1))
         for offset, turn, axis, joint in links:
@@ -492,12 +454,8 @@ class Env:
 
     # --- mirrors ---
 
-    def width(self, kind):
-        """Length of an observation block."""
-        return {"joint": self.action_dim, "scalar": 1, "heading": 2}.get(kind, 3)
-
     def mirror_block(self, mirror, kind):
-        """perm, sign of one block of an observation."""
+        """perm, sign of one block."""
         polar, axial = POLAR[mirror], AXIAL[mirror]
         if kind == "joint":
             return self.robot.mirror_joints(mirror)
@@ -506,12 +464,12 @@ class Env:
             "axial": axial,
             "planar": np.array([polar[0], polar[1], axial[2]]),
             "scalar": np.array([1]),
-            "heading": np.array([-1, 1]),  # sine and cosine of an angle about z
+            "heading": np.array([-1, 1]),  # sine, cosine of an angle about z
         }
         return np.arange(len(signs[kind])), signs[kind]
 
     def mirror_tables(self, mirror):
-        """perm, sign for `obs`, `prop` and `action` vectors: mirrored = sign * original[perm]."""
+        """perm, sign of `obs`, `prop` and `action` vectors: mirrored = sign * original[perm]."""
         tables = {}
         kinds = {"obs": [kind for kind, _ in self.OBS.values()], "prop": list(PROP.values()), "action": ["joint"]}
         for name, blocks in kinds.items():
@@ -525,27 +483,21 @@ class Env:
         return tables
 
     def mirror(self, mirror, name, array):
-        """Mirror image of obs, prop or action arrays (..., width); applying it twice gives the original."""
+        """Mirror image of an array (..., width) named obs, prop or action. Mirroring it again gives the original."""
         perm, sign = self.mirrors[mirror][name]
         return array[..., perm] * sign
 
 
 def joint_indices(robot, *parts):
-    """Indices of the joints whose name contains one of `parts`."""
-    return np.array([i for i, joint in enumerate(robot.joints) if any(part in joint for part in parts)])
+    """Indices of the joints whose name contains one of `parts`. ValueError if there are none."""
+    found = [i for i, joint in enumerate(robot.joints) if any(part in joint for part in parts)]
+    if not found:
+        raise ValueError(f"no joint of {robot.name} has {' or '.join(map(repr, parts))} in its name")
+    return np.array(found)
 
 
 def soft_limits(model, factor):
-    """Joint limits (A,), (A,) shrunk about their middle."""
+    """Joint limits (A,), (A,) scaled about their middle by `factor`."""
     low, high = model.jnt_range[1:].T
     middle, half = (low + high) / 2, (high - low) / 2
     return middle - factor * half, middle + factor * half
-
-
-def replace_checked(config, overrides):
-    """A config with some fields replaced; ValueError names a field that does not exist."""
-    fields = [field.name for field in dataclasses.fields(config)]
-    for name in overrides:
-        if name not in fields:
-            raise ValueError(f"unknown option {name!r}; choose one of {', '.join(sorted(fields))}")
-    return dataclasses.replace(config, **overrides)

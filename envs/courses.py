@@ -1,8 +1,8 @@
-"""Obstacle courses of the five parkour skills: which slabs a scene has, and where a level puts them.
+"""Obstacle courses of the five parkour skills: the slabs of each, and their places at a difficulty `t` from 0 to 1.
 
-An obstacle is drawn as (poses, goal): poses (M, 4) of slab centres x, y, z [m] and tilt about y [rad] in the order of
-the skill's slabs, and the goal (3,) for the base [m]. The robot starts at x = 0 and faces +x. `t` is the level's
-difficulty from 0 to 1. Sizes and ranges: Hoeller et al. 2023 where published, else ours.
+An obstacle is a function (key, t) -> poses, goal. A row of poses (M, 4) is the centre x, y, z [m] of a slab and its
+tilt about y [rad]. The goal (3,) is for the base [m]. The robot starts at x = 0 and faces +x.
+Sizes and ranges are Hoeller et al.'s (2023) where published, else ours.
 """
 
 from collections.abc import Callable
@@ -30,15 +30,16 @@ def pose(x, z, tilt=0.0, y=0.0):
     return jnp.stack([jnp.asarray(v, jnp.float32) for v in (x, y, z, tilt)])
 
 
-AWAY = (0.0, 0.0, PARKED, 0.0)
+AWAY = (0.0, 0.0, PARKED, 0.0)  # pose of a slab that is not used
 
 
 def between(t, easy, hard):
+    """Interpolate between the easiest level, t = 0, and the hardest, t = 1."""
     return easy + t * (hard - easy)
 
 
 def rough_ground(key, t):
-    """Twelve tiles (12, 4) of random height about the way ahead, and a goal 2 to 4 m away."""
+    """Twelve tiles (12, 4) of random height between the robot and a goal 2 to 4 m ahead."""
     k_x, k_y, k_z, k_gx, k_gy = jax.random.split(key, 5)
     x, y = uniform(k_x, 0.9, 3.5, (12,)), uniform(k_y, -0.8, 0.8, (12,))
     top = uniform(k_z, 0.0, between(t, 0.02, 0.08), (12,))
@@ -55,7 +56,7 @@ def climb_up(key, t):
 
 
 def climb_down(key, t):
-    """The robot starts on a box of 0.1 to 1.0 m; the goal is on the floor before it."""
+    """A box of 0.1 to 1.0 m on which the robot starts; the goal is on the floor ahead."""
     k_x, k_gx, k_gy = jax.random.split(key, 3)
     x, height = uniform(k_x, 0.7, 1.0), between(t, 0.1, 1.0)
     goal = jnp.stack([x + uniform(k_gx, 1.2, 1.8), uniform(k_gy, -0.3, 0.3), jnp.float32(0.5)])
@@ -102,46 +103,46 @@ def walk(key, t):
     slope = pose(x + reach / 2 - thick * jnp.sin(tilt), height / 2 - thick * jnp.cos(angle), tilt)[None]
     ramp = jnp.concatenate([jnp.tile(away, (STEPS, 1)), slope, landing(height, reach)])
     uneven = planks(uniform(k_top, 0.0, 1.0, (STEPS,)) * between(t, 0.05, 0.25))
-    rough = jnp.concatenate([uneven, away, away])
+    uneven = jnp.concatenate([uneven, away, away])
 
     ahead = jnp.stack([STEPS * TREAD, reach, STEPS * TREAD])[kind]
     top = jnp.where(up, jnp.stack([STEPS * rise, height, 0.0]), 0.0)[kind]
     goal = jnp.stack([x + ahead + 1.0, uniform(k_y, -0.3, 0.3), top + 0.5])
-    return jnp.stack([stairs, ramp, rough])[kind], goal
+    return jnp.stack([stairs, ramp, uneven])[kind], goal
 
 
 @dataclass(frozen=True)
 class Skill:
-    """Slabs of an obstacle, where a level puts them, and the height of the floor below."""
+    """An obstacle: its slabs, their places, and the height of the floor below."""
 
     slabs: tuple[Slab, ...]
     obstacle: Callable  # (key, t) -> poses, goal
     floor: float = 0.0  # [m]
-    plain: tuple = ()  # poses of the obstacle's slabs in an episode on rough tiles; (): there are none
+    rough_poses: tuple = ()  # poses of the obstacle's slabs in episodes on rough tiles; (): no such episodes
 
 
 SKILLS = {
     "walk": Skill((*PLANKS, RAMP, LANDING), walk),
-    "climb_up": Skill((BLOCK,), climb_up, plain=(AWAY,)),
-    "climb_down": Skill((BLOCK,), climb_down, plain=(AWAY,)),
-    "crouch": Skill((TABLE,), crouch, plain=(AWAY,)),
-    "jump": Skill((NEAR, FAR), jump, floor=-1.0, plain=((0.0, 0.0, -0.5, 0.0), (3.0, 0.0, -0.5, 0.0))),  # no gap
+    "climb_up": Skill((BLOCK,), climb_up, rough_poses=(AWAY,)),
+    "climb_down": Skill((BLOCK,), climb_down, rough_poses=(AWAY,)),
+    "crouch": Skill((TABLE,), crouch, rough_poses=(AWAY,)),
+    "jump": Skill((NEAR, FAR), jump, floor=-1.0, rough_poses=((0.0, 0.0, -0.5, 0.0), (3.0, 0.0, -0.5, 0.0))),  # no gap
 }
 
 
 def all_slabs(skill):
-    """The obstacle's slabs, and tiles after them where the skill has episodes on rough ground."""
-    return (*skill.slabs, *TILES) if skill.plain else skill.slabs
+    """The slabs of the obstacle, then the tiles if the skill has episodes on rough tiles."""
+    return (*skill.slabs, *TILES) if skill.rough_poses else skill.slabs
 
 
 def draw_course(skill, key, t, share):
-    """Poses (M, 4) of all_slabs, goal (3,) [m], and whether () this is one of the `share` without the obstacle."""
-    if not skill.plain:
+    """Poses (M, 4) of all_slabs, goal (3,) [m], and () true in the `share` of episodes on rough tiles."""
+    if not skill.rough_poses:
         return *skill.obstacle(key, t), jnp.asarray(False)
     k_share, k_obstacle, k_rough = jax.random.split(key, 3)
     poses, goal = skill.obstacle(k_obstacle, t)
     tiles, far_goal = rough_ground(k_rough, t)
     rough = uniform(k_share, 0.0, 1.0) < share
     obstacle = jnp.concatenate([poses, jnp.tile(jnp.array([AWAY]), (len(TILES), 1))])
-    ground = jnp.concatenate([jnp.array(skill.plain), tiles])
+    ground = jnp.concatenate([jnp.array(skill.rough_poses), tiles])
     return jnp.where(rough, ground, obstacle), jnp.where(rough, far_goal, goal), rough

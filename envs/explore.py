@@ -1,17 +1,17 @@
-"""Exploration without a task, for the data of stage 1 (paper Sec. IV-C): the robot sees x_t and its last action.
+"""Exploration without a task, for the data of stage 1 (paper Sec. IV-C). The robot sees x_t and its last action.
 
-The reward for what is worth seeing comes from the ensemble in ppo_explore.py; here are the regularisers that any task
-has. Every episode starts on the plane or on rough ground, with its own masses and friction, and is pushed about.
+ppo_explore.py adds the reward of exploration; the terms here only regularise. Every episode starts on the plane or on
+rough ground, with masses and friction of its own, and is disturbed by pushes and forces.
 """
 
 from dataclasses import dataclass
 
-import flax
 import jax
 import jax.numpy as jnp
 
 from envs import rewards, terrain
-from envs.base import BODY, Config, Env, FootClocks, uniform
+from envs.base import BODY, Env, FootClocks, uniform
+from envs.config import Config
 from envs.locomotion import G1_LOCO
 
 
@@ -20,19 +20,11 @@ class ExploreConfig(Config):
     """Numbers of an exploration environment."""
 
     rough: float = 0.5  # share of episodes on rough ground
-    amplitude: float = 0.05  # [m] of the rough ground
-    spawn_spread: float = 4.0  # [m] half-width around the middle of the ground
-    hasty: float = 0.2  # [s] flights shorter than this are punished
+    amplitude: float = 0.05  # [m] of the rough ground, whose heights are 0 to twice this
+    spawn_spread: float = 4.0  # [m] half-width around the middle of either ground
+    hasty: float = 0.2  # [s] shortest flight of a foot without a penalty
     perturb_force: float = 0.0  # [N] half-width of each component of a force on the base
-    perturb_seconds: float = 2.0  # mean time between its changes; half the draws are zero
-    calm: float = 1.0  # every episode multiplies all actions by a number of its own between this and 1
-
-
-@flax.struct.dataclass
-class Task(FootClocks):
-    """State of exploration."""
-
-    vigour: jax.Array  # () what the policy's actions are multiplied by in this episode
+    perturb_seconds: float = 2.0  # mean time between changes of the force; half of the draws are zero
 
 
 class Explore(Env):
@@ -46,7 +38,7 @@ class Explore(Env):
         return terrain.rough_scene(self.robot, self.heights, visual)
 
     def ground_height(self, course, xy):
-        """Bilinear in the field's grid, 0 beside it."""
+        """Height [m] by bilinear interpolation in the rough field, 0 beside it."""
         at = (xy - jnp.array([terrain.ROUGH_CENTRE, 0.0]) + terrain.ROUGH_HALF) / terrain.CELL
         rows_cols = jnp.moveaxis(at[..., ::-1], -1, 0)
         return jax.scipy.ndimage.map_coordinates(jnp.asarray(self.heights), list(rows_cols), order=1, cval=0.0)
@@ -59,11 +51,11 @@ class Explore(Env):
         return xy, uniform(k_yaw, -c.spawn_yaw, c.spawn_yaw)
 
     def on_rough(self, physics):
-        """Whether the base is over the rough ground."""
+        """True (...) if the base is over the rough ground."""
         return jnp.abs(physics.qpos[..., 0] - terrain.ROUGH_CENTRE) < terrain.ROUGH_HALF
 
     def push(self, key, physics, clock, push_at):
-        """Pushes as in the tasks, and a force on the base that changes now and then."""
+        """Push as in every task, and now and then change the force on the base."""
         k_push, k_when, k_force, k_zero = jax.random.split(key, 4)
         physics, push_at = super().push(k_push, physics, clock, push_at)
         force = uniform(k_force, -self.config.perturb_force, self.config.perturb_force, (3,))
@@ -72,18 +64,11 @@ class Explore(Env):
         wrench = physics.wrench.at[1, :3].set(jnp.where(changes, force, physics.wrench[1, :3]))
         return physics.replace(wrench=wrench), push_at
 
-    def executed(self, state, action):
-        """What the robot does when the policy says `action` (A,)."""
-        return state.task.vigour * action
-
-    def step(self, state, action):
-        return super().step(state, self.executed(state, action))
-
     def init_task(self, key, physics, course):
         feet = jnp.zeros(len(self.robot.feet))
-        return Task(feet, feet, feet, vigour=uniform(key, self.config.calm, 1.0))
+        return FootClocks(feet, feet, feet)
 
-    def track(self, task, motion):
+    def before_rewards(self, task, motion):
         return task.tick(motion.foot_contact, self.dt)
 
     def rewards(self, task, motion, action, last_action, clock):
@@ -96,7 +81,7 @@ class Explore(Env):
         }
 
 
-# Data are stored without sensor noise: stage 2 adds it anew to every sample.
+# Data are stored without sensor noise; stage 2 adds it anew to every sample.
 SHARED = {
     "ppo": {"hidden": (128, 128, 128), "entropy": 0.0, "init_std": 1.0},
     "noise": 0.0,
@@ -110,7 +95,7 @@ SHARED = {
     "push_seconds": (3.0, 6.0),
 }
 
-# Regularisers of at most the size of what the ensemble pays, 2 per second; sums over G1's 29 joints weigh 12 / 29.
+# Regularisers cost less than exploration pays, 2 per second. Sums over G1's 29 joints weigh about 12 / 29.
 EXPLORE = {
     "anymal_d": ExploreConfig(
         robot="anymal_d",

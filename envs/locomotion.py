@@ -1,6 +1,6 @@
 """Velocity tracking on flat ground, blind: anymal_loco, go1_loco, g1_loco (paper Sec. V-A; Isaac Lab's flat tasks).
 
-A command asks for a forward and sideways velocity and a heading; the heading error sets the turning rate.
+A command is a forward velocity, a sideways velocity and a heading. The heading error sets the turning rate.
 """
 
 from dataclasses import dataclass
@@ -10,21 +10,23 @@ import jax
 import jax.numpy as jnp
 
 from envs import rewards
-from envs.base import Config, Env, FootClocks, axis_angle, inverse, joint_indices, rotate, soft_limits, uniform, wrap
+from envs.base import Env, FootClocks, joint_indices, select, soft_limits, uniform
+from envs.config import Config, Range
+from envs.rotations import axis_angle, inverse, rotate, wrap
 
 
 @dataclass(frozen=True)
 class LocomotionConfig(Config):
     """Numbers of a velocity-tracking task."""
 
-    lin_vel_x: tuple[float, float] = (-1.0, 1.0)  # [m/s] forward command
-    lin_vel_y: tuple[float, float] = (-1.0, 1.0)  # [m/s] sideways command
+    lin_vel_x: Range = (-1.0, 1.0)  # [m/s] forward command
+    lin_vel_y: Range = (-1.0, 1.0)  # [m/s] sideways command
     yaw_rate: float = 1.0  # [rad/s] half-width of the turning command
-    command_seconds: float = 10.0  # a new command comes this often
-    standing: float = 0.02  # share of commands that ask to stand still
-    fixed_velocity: tuple[float, float] | None = None  # [m/s] vx, vy along the world's x for all; for evaluation
+    command_seconds: float = 10.0  # time between commands
+    standing: float = 0.02  # share of commands to stand still
+    fixed_velocity: tuple[float, float] | None = None  # [m/s] forward, sideways with heading 0, in place of commands
     air_time_threshold: float = 0.5  # [s]
-    effort_joints: tuple[str, ...] = ("",)  # name parts of the joints whose torque and acceleration are punished
+    effort_joints: tuple[str, ...] = ("",)  # parts of the names of joints with torque and acceleration penalties
 
 
 @flax.struct.dataclass
@@ -32,12 +34,12 @@ class Task(FootClocks):
     """State of velocity tracking."""
 
     command: jax.Array  # (3,) forward [m/s], sideways [m/s], turning [rad/s], base frame
-    heading: jax.Array  # () wanted yaw [rad]
-    moves: jax.Array  # () bool: not one of the standing commands
+    heading: jax.Array  # () commanded yaw [rad]
+    moves: jax.Array  # () bool: not a command to stand still
 
 
 class Locomotion(Env):
-    # Deviation: inputs are scaled as in legged_gym, where Isaac Lab feeds them raw; see README.
+    # Deviation (input scaling): as in legged_gym. Isaac Lab feeds inputs raw.
     OBS = {
         "lin_vel": ("polar", 2.0),
         "ang_vel": ("axial", 0.25),
@@ -47,9 +49,8 @@ class Locomotion(Env):
         "joint_vel": ("joint", 0.05),
         "action": ("joint", 0.5),
     }
-
-    SHOWCASE = {"fixed_velocity": (0.8, 0.0), "spawn_yaw": 0.0, "spawn_xy": 0.0}
-    COMMAND = {"forward [m/s]": (-1.0, 1.0), "sideways [m/s]": (-1.0, 1.0), "turning [rad/s]": (-1.0, 1.0)}
+    SHOWCASE_FIELDS = {"fixed_velocity": (0.8, 0.0), "spawn_yaw": 0.0, "spawn_xy": 0.0}
+    COMMAND_RANGES = {"forward [m/s]": (-1.0, 1.0), "sideways [m/s]": (-1.0, 1.0), "turning [rad/s]": (-1.0, 1.0)}
 
     def __init__(self, config, engine="auto"):
         super().__init__(config, engine)
@@ -63,7 +64,7 @@ class Locomotion(Env):
         return self.steer(task, self.motion(physics).yaw)
 
     def draw_command(self, key):
-        """A new command (3,), heading () and whether it moves at all."""
+        """A new command: velocity (3,), heading () and `moves` ()."""
         c = self.config
         if c.fixed_velocity is not None:
             return jnp.array([*c.fixed_velocity, 0.0]), jnp.zeros(()), jnp.ones((), bool)
@@ -72,21 +73,20 @@ class Locomotion(Env):
         return command, uniform(k_heading, -jnp.pi, jnp.pi), uniform(k_stand, 0.0, 1.0) >= c.standing
 
     def steer(self, task, yaw):
-        """Turn towards the heading; stand if the command says so."""
+        """Set the turning rate from the heading error, and all velocities to 0 for a command to stand still."""
         turn = jnp.clip(0.5 * wrap(task.heading - yaw), -self.config.yaw_rate, self.config.yaw_rate)
         return task.replace(command=jnp.where(task.moves, task.command.at[2].set(turn), 0.0))
 
-    def told(self, task, wanted):
-        return task.replace(command=wanted)
+    def set_command(self, task, command):
+        return task.replace(command=command)
 
-    def track(self, task, motion):
+    def before_rewards(self, task, motion):
         return task.tick(motion.foot_contact, self.dt)
 
-    def advance(self, key, task, motion, clock):
+    def after_rewards(self, key, task, motion, clock):
         command, heading, moves = self.draw_command(key)
-        fresh = task.replace(command=command, heading=heading, moves=moves)
         due = clock % self.command_steps == 0
-        task = jax.tree.map(lambda new, old: jnp.where(due, new, old), fresh, task)
+        task = select(due, task.replace(command=command, heading=heading, moves=moves), task)
         return self.steer(task, motion.yaw)
 
     def task_inputs(self, task, motion, clock):
@@ -117,7 +117,7 @@ class Locomotion(Env):
 
 
 class AnymalLocomotion(Locomotion):
-    """ANYmal D also pays for thighs that touch the ground."""
+    """ANYmal D, with a penalty for thighs that touch the ground."""
 
     def __init__(self, config, engine="auto"):
         super().__init__(config, engine)
@@ -129,7 +129,7 @@ class AnymalLocomotion(Locomotion):
 
 
 class G1Locomotion(Locomotion):
-    """The humanoid's gait terms: single stance, slip, and joints that should stay near the default pose."""
+    """G1, with terms for a biped's gait and for joints that should stay near the default pose."""
 
     def __init__(self, config, engine="auto"):
         super().__init__(config, engine)
@@ -142,7 +142,7 @@ class G1Locomotion(Locomotion):
     def rewards(self, task, motion, action, last_action, clock):
         m = motion
         low, high = self.soft_limits
-        # tracked in the heading frame, so that a leaning or pitching trunk costs no velocity
+        # Velocities are tracked in the heading frame: a trunk that leans or pitches loses no reward.
         upright = axis_angle(jnp.array([0.0, 0, 1]), m.yaw)
         lin_vel, ang_vel = (rotate(inverse(upright), rotate(m.quat, v)) for v in (m.lin_vel, m.ang_vel))
         ankles = (m.joint_pos + self.default_pose)[self.ankles]
@@ -159,10 +159,10 @@ class G1Locomotion(Locomotion):
         }
 
 
-# Deviation: Isaac Lab's weights make every early return negative at CPU batch sizes, and robots learn to fall at once.
-# So the weights of roll_pitch_rate, torque and joint_acc are a quarter, there is a reward for being alive and a floor
-# under the total; air_time counts from 0.1 s; slip and pose stop quadrupeds from dragging their feet; see README.
-# Deviation: no entropy bonus (Isaac Lab: 0.005 to 0.01): with it the policy comes to depend on its own noise.
+# Deviation (reward weights): Isaac Lab's make every early return negative at CPU batch sizes: robots learn to fall.
+# So roll_pitch_rate, torque and joint_acc weigh a quarter, being alive is rewarded, and the total has a floor. air_time
+# counts from 0.1 s. slip and pose keep quadrupeds from dragging their feet.
+# Deviation (entropy bonus): none (Isaac Lab: 0.005 to 0.01). With it the policy comes to depend on its own noise.
 BLIND_QUADRUPED = {
     "hidden": (128, 128, 128),
     "entropy": 0.0,
@@ -224,8 +224,8 @@ G1_LOCO = LocomotionConfig(
     weights={
         "track_lin_vel": 1.0,
         "track_yaw_rate": 1.0,
-        # Deviation: with Isaac Lab's 0.75 and no flight term it hops on both feet; without one_foot and air_time it
-        # shuffles on both at once. Isaac Lab's G1 has a single torso joint, which cannot bow.
+        # Deviation (G1 gait): With Isaac Lab's 0.75 and no flight term it hops on both feet. Without one_foot and
+        # air_time it shuffles on both at once. waist_deviation is -0.1 there, but their G1 cannot bow.
         "single_stance": 2.0,
         "one_foot": 0.5,
         "air_time": 1.0,
@@ -255,7 +255,7 @@ G1_LOCO = LocomotionConfig(
     lin_vel_x=(0.0, 1.0),
     lin_vel_y=(-0.5, 0.5),
     effort_joints=("hip", "knee"),
-    # Deviation: any part but the feet ends the episode, not the torso alone: else the robot learns to sit.
+    # Deviation (G1 contacts): Any part but the feet ends the episode, not the torso alone. Else it learns to sit.
     contact_ends=("torso", "pelvis", *(f"{side}_{part}" for side in ("left", "right") for part in G1_PARTS)),
     max_tilt=70.0,
 )

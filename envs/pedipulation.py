@@ -1,7 +1,7 @@
 """Pedipulation with ANYmal D: stand or walk on three legs while the right front foot tracks a point (Arm et al. 2024).
 
-The point is fixed in the world for 6 s at a time and drawn from a box in front of where the episode began, so the robot
-has to walk for far ones. There is no symmetry, since it is always the same foot: no mirror loss.
+The point is drawn from a box around the start of the episode, and stays in the world for 6 s. The robot has to walk to
+far points. It is always the same foot, so there is no symmetry and no mirror loss.
 """
 
 from dataclasses import dataclass
@@ -12,55 +12,59 @@ import jax.numpy as jnp
 import numpy as np
 
 from envs import rewards
-from envs.base import BODY, Config, Env, inverse, rotate, uniform
+from envs.base import BODY, Env, uniform
+from envs.config import Config, Range
 from envs.locomotion import BLIND_QUADRUPED
+from envs.rotations import inverse, rotate
 
 
 @dataclass(frozen=True)
 class PedipulationConfig(Config):
     """Numbers of pedipulation."""
 
-    foot: str = "RF_foot"  # the one that points
-    box: tuple = ((0.0, 1.0), (-0.4, 0.2), (-0.1, 1.3))  # [m] of the point, where the episode began; x forward, y left
-    final_box: tuple = ((0.0, 2.2), (-1.2, 1.2), (-0.1, 1.3))  # [m] what the curriculum grows to
-    curriculum: bool = False  # grow the box with each environment's success (off in the paper)
-    fixed_point: tuple[float, float, float] | None = None  # [m] the same point for all; for evaluation
-    command_seconds: float = 6.0  # a new point comes this often
+    foot: str = "RF_foot"  # the foot that points
+    # [m] ranges of the point's x (forward), y (left) and z, from the start of the episode
+    box: tuple[Range, Range, Range] = ((0.0, 1.0), (-0.4, 0.2), (-0.1, 1.3))
+    final_box: tuple[Range, Range, Range] = ((0.0, 2.2), (-1.2, 1.2), (-0.1, 1.3))  # at the curriculum's end
+    curriculum: bool = False  # grow the box with the success of each environment (off in the paper)
+    fixed_point: tuple[float, float, float] | None = None  # [m] the one point, for evaluation
+    command_seconds: float = 6.0  # time between points
     all_feet_force: float = 0.0  # [N] largest constant force on every foot, per axis
-    foot_force: float = 0.0  # [N] half-width of a force on the pointing foot, per axis
+    foot_force: float = 0.0  # [N] half-width of a changing force on the pointing foot, per axis
 
 
 @flax.struct.dataclass
 class Task:
     """State of pedipulation."""
 
-    point: jax.Array  # (3,) wanted foot position, world [m]
-    difficulty: jax.Array  # () 0 to 10: how far the box has grown; stays over resets
+    point: jax.Array  # (3,) commanded foot position, world [m]
+    difficulty: jax.Array  # () growth of the box, 0 to 10; carried over resets
     error_sum: jax.Array  # () [m] summed over the episode
     steps: jax.Array  # () control steps in that sum
 
 
 class Pedipulation(Env):
     OBS = BODY | {"target": ("polar", 1.0)}
-
-    SHOWCASE = {"fixed_point": (0.7, -0.2, 0.5)}
-    COMMAND = {"x [m]": (0.0, 1.0), "y [m]": (-0.4, 0.2), "z [m]": (-0.1, 1.3)}
+    SHOWCASE_FIELDS = {"fixed_point": (0.7, -0.2, 0.5)}
+    COMMAND_RANGES = {"x [m]": (0.0, 1.0), "y [m]": (-0.4, 0.2), "z [m]": (-0.1, 1.3)}
 
     def __init__(self, config, engine="auto"):
         super().__init__(config, engine)
+        if config.foot not in self.robot.feet:
+            raise ValueError(f"unknown foot {config.foot!r}; choose one of {', '.join(self.robot.feet)}")
         self.mirrors = {}
         self.foot = self.robot.feet.index(config.foot)
         self.shanks = np.array([self.model.site(foot).bodyid[0] for foot in self.robot.feet])
         legs = [foot.removesuffix("_foot") for foot in self.robot.feet]
-        touching = [f"{leg}_{part}_force" for leg in legs for part in ("thigh", "knee", "shank")]
-        self.bodies = self.engine.sensor(*touching, f"{config.foot}_force")
+        parts = [f"{leg}_{part}_force" for leg in legs for part in ("thigh", "knee", "shank")]
+        self.collision_sensors = self.engine.sensor(*parts, f"{config.foot}_force")
         self.command_steps = round(config.command_seconds / self.dt)
 
     def first_curriculum(self):
         return {"difficulty": jnp.zeros(())}
 
-    def graduate(self, key, task, motion, terminated, truncated):
-        """With the curriculum on: the box grows after an episode of little error (Arm et al.: for all at once)."""
+    def next_curriculum(self, key, task, motion, terminated, truncated):
+        """Grow this environment's box after an episode of little error (Arm et al. grow one box for all)."""
         grown = truncated & (task.error_sum < 0.06 * task.steps) & self.config.curriculum
         return {"difficulty": jnp.minimum(task.difficulty + grown, 10.0)}
 
@@ -69,47 +73,46 @@ class Pedipulation(Env):
         return Task(self.draw_point(key, difficulty), difficulty, zero, zero)
 
     def draw_point(self, key, difficulty):
-        """A point (3,) in the box of this difficulty."""
+        """A point (3,) in the box of a difficulty."""
         if self.config.fixed_point is not None:
             return jnp.array(self.config.fixed_point)
         start, end = jnp.array(self.config.box), jnp.array(self.config.final_box)
         low, high = (start + difficulty / 10 * (end - start)).T
         return uniform(key, low, high, (3,))
 
-    def told(self, task, wanted):
-        return task.replace(point=wanted)
+    def set_command(self, task, command):
+        return task.replace(point=command)
 
-    def track(self, task, motion):
+    def before_rewards(self, task, motion):
         error = self.foot_error(task, motion)
         return task.replace(error_sum=task.error_sum + error, steps=task.steps + 1)
 
-    def advance(self, key, task, motion, clock):
-        return task.replace(
-            point=jnp.where(clock % self.command_steps == 0, self.draw_point(key, task.difficulty), task.point)
-        )
+    def after_rewards(self, key, task, motion, clock):
+        due = clock % self.command_steps == 0
+        return task.replace(point=jnp.where(due, self.draw_point(key, task.difficulty), task.point))
 
     def spawn(self, key, course):
-        """As in every task, with a constant force on each foot (at its shank's centre of mass)."""
+        """Physics as in every task, with a constant force on each foot, at the centre of mass of its shank."""
         k_force, key = jax.random.split(key)
         physics = super().spawn(key, course)
         force = uniform(k_force, 0.0, self.config.all_feet_force, (len(self.shanks), 3))
         return physics.replace(wrench=physics.wrench.at[self.shanks, :3].set(force))
 
     def push(self, key, physics, clock, push_at):
-        """Pushes as in every task, each with a new force on the pointing foot."""
+        """Push as in every task, and change the force on the pointing foot."""
         k_push, k_force = jax.random.split(key)
         force = uniform(k_force, -self.config.foot_force, self.config.foot_force, (3,))
         shank = self.shanks[self.foot]
-        held = jnp.where(clock >= push_at, force, physics.wrench[shank, :3])
+        force = jnp.where(clock >= push_at, force, physics.wrench[shank, :3])
         physics, push_at = super().push(k_push, physics, clock, push_at)
-        return physics.replace(wrench=physics.wrench.at[shank, :3].set(held)), push_at
+        return physics.replace(wrench=physics.wrench.at[shank, :3].set(force)), push_at
 
     def foot_error(self, task, motion):
         """Distance of the pointing foot from its point [m]."""
         return jnp.linalg.norm(motion.foot_pos[self.foot] - task.point)
 
     def task_inputs(self, task, motion, clock):
-        """The point in the base frame (3,) [m]."""
+        """The point (3,) in the base frame [m]."""
         return {"target": rotate(inverse(motion.quat), task.point - motion.base_pos)}
 
     def rewards(self, task, motion, action, last_action, clock):
@@ -120,15 +123,15 @@ class Pedipulation(Env):
             "joint_acc": rewards.square(m.joint_acc),
             "joint_vel": rewards.square(m.joint_vel),
             "action_rate": rewards.square(action - last_action),
-            "collision": rewards.touching(m.sensors[self.bodies]),
+            "collision": rewards.touching(m.sensors[self.collision_sensors]),
         }
 
     def task_metrics(self, task, motion, truncated):
         return {"foot_error": self.foot_error(task, motion)}  # [m]
 
 
-# Deviation: disturbances are softer than Arm et al.'s (pushes 1.5, foot force 50 N, friction 0 to 1.5); penalties of
-# joint acceleration and velocity are a quarter, and the total is floored as in locomotion.
+# Deviation (pedipulation): Disturbances are weaker than Arm et al.'s (pushes 1.5, foot force 50 N, friction 0 to 1.5).
+# joint_acc and joint_vel weigh a quarter, and the total has a floor as in locomotion.
 ANYMAL_PEDIPULATION = PedipulationConfig(
     robot="anymal_d",
     weights={

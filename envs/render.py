@@ -1,7 +1,7 @@
-"""Pictures of a rollout: a filmstrip, a GIF or an MP4, by MuJoCo's renderer or, without OpenGL, by matplotlib.
+"""Pictures of a rollout: a strip of frames, a GIF or an MP4, by MuJoCo's renderer or, without OpenGL, by matplotlib.
 
-MuJoCo chooses its OpenGL for good when it is imported, and a broken driver can end the process. So frames are drawn
-in a second process, this file run as a script, which is tried with one OpenGL after the other.
+MuJoCo fixes its OpenGL when it is imported, and a broken driver can end the process. So this file runs as a script in
+a second process, which draws the frames, and tries one OpenGL after the other.
 """
 
 import os
@@ -16,13 +16,14 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 WIDTH, HEIGHT = 320, 240  # [pixels] of one frame
-EVERY = 2  # control steps from frame to frame of a film
+EVERY = 2  # control steps between frames of a moving picture
 
 
-def film(env, qpos, course, folder, start=4.0, strip_seconds=1.0, strip_frames=10, gif_seconds=4.0):
-    """Write rollout.png (ten frames) and rollout.gif of qpos (steps, nq) on a course. Returns the two paths.
+def film(env, qpos, course, folder, start=4.0, strip_seconds=0.6, strip_frames=10, gif_seconds=4.0):
+    """Write rollout.png, a strip of frames, and rollout.gif of qpos (steps, nq) on a course. Returns the two paths.
 
-    The film starts `start` seconds in, when the robot has found its pace, or earlier if the rollout is short.
+    Both start after `start` seconds, when the robot has found its pace, or earlier if the rollout is short. By default
+    the strip has a frame every 0.06 s, so a stride of 0.3 to 0.45 s appears in five to seven phases.
     """
     qpos = np.asarray(qpos, np.float64)
     first = max(0, min(round(start / env.dt), len(qpos) - round(gif_seconds / env.dt)))
@@ -44,26 +45,27 @@ def film(env, qpos, course, folder, start=4.0, strip_seconds=1.0, strip_frames=1
 
 
 def save_gif(images, dt, path):
-    """Images EVERY control steps apart, as an endless GIF."""
+    """Write images, EVERY control steps apart, as an endless GIF."""
     frames = [image.quantize(64) for image in images]
     frames[0].save(path, save_all=True, append_images=frames[1:], duration=round(1000 * EVERY * dt), loop=0)
 
 
 def check_video(path):
-    """ValueError unless `video` can write such a file here."""
+    """ValueError unless `video` can write a file of this name."""
     if path.suffix not in (".gif", ".mp4"):
         raise ValueError(f"{path} must end in .gif or .mp4")
     if path.suffix == ".mp4" and not shutil.which("ffmpeg"):
-        raise ValueError("an MP4 needs the program ffmpeg; install it, or name a .gif")
+        raise ValueError("an MP4 needs the program ffmpeg; install it, or choose a .gif")
 
 
 def video(env, qpos, course, path):
-    """Write a rollout qpos (steps, nq) on a course as a GIF or MP4, as its name ends; see check_video."""
+    """Write a rollout qpos (steps, nq) on a course as a GIF or MP4, after the end of its name; see check_video."""
     path.parent.mkdir(parents=True, exist_ok=True)
     size = (WIDTH, HEIGHT) if path.suffix == ".gif" else (2 * WIDTH, 2 * HEIGHT)  # a GIF grows large
     images = draw(build(env, course), np.asarray(qpos[::EVERY], np.float64), size)
     if path.suffix == ".gif":
-        return save_gif(images, env.dt, path)
+        save_gif(images, env.dt, path)
+        return
     width, height = images[0].size
     command = ["ffmpeg", "-y", "-loglevel", "error", "-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}"]
     command += ["-r", f"{1 / (EVERY * env.dt):g}", "-i", "-", "-pix_fmt", "yuv420p", str(path)]
@@ -72,11 +74,10 @@ def video(env, qpos, course, path):
             encoder.stdin.write(image.tobytes())
     if encoder.returncode:
         raise ValueError(f"ffmpeg could not write {path}")
-    return None
 
 
 def build(env, course):
-    """MjSpec of an environment's scene, its obstacles where a course (or a Physics) has them."""
+    """MjSpec of an environment's scene, with the obstacles at their places in a course (or a Physics)."""
     spec = env.scene(visual=True)
     slabs = [body for body in spec.bodies if body.mocap]
     for body, pos, quat in zip(slabs, course.mocap_pos, course.mocap_quat, strict=True):
@@ -87,27 +88,27 @@ def build(env, course):
 def draw(spec, qpos, size=(WIDTH, HEIGHT)):
     """Images of poses (n, nq), by the first OpenGL that works, else by matplotlib."""
     model = spec.compile()
-    wanted = os.environ.get("MUJOCO_GL")
-    names = [wanted] if wanted else (["glfw"] if os.environ.get("DISPLAY") else []) + ["egl", "osmesa"]
+    from envs import gl  # not at the top, for the second process has no package `envs`
+
+    names = [name for name in (gl.ASKED, "glfw" if os.environ.get("DISPLAY") else "", "egl", "osmesa") if name]
     with tempfile.TemporaryDirectory() as folder:
         Path(folder, "model.xml").write_text(spec.to_xml())
         np.save(Path(folder, "qpos.npy"), qpos)
-        for name in names:
+        for name in dict.fromkeys(names):
             command = [sys.executable, __file__, folder, *map(str, size)]
-            run = subprocess.run(command, env=os.environ | {"MUJOCO_GL": name}, capture_output=True, check=False)
-            if run.returncode == 0:
+            done = subprocess.run(command, env=os.environ | {"MUJOCO_GL": name}, capture_output=True, check=False)
+            if done.returncode == 0:
+                if gl.ASKED and name != gl.ASKED:
+                    print(f"MUJOCO_GL={gl.ASKED} does not work here: drew with {name}")
                 return [Image.fromarray(frame) for frame in np.load(Path(folder, "frames.npy"))]
-    print(
-        "no OpenGL here (tried "
-        + ", ".join(names)
-        + "): drawing stick figures; Debian's libosmesa6 gives real pictures"
-    )
+    tried = ", ".join(names)
+    print(f"no OpenGL here (tried {tried}): drawing stick figures; Debian's libosmesa6 gives real pictures")
     data = mujoco.MjData(model)
     return [stick_figure(model, data, q) for q in qpos]
 
 
 def render(folder, width, height):
-    """In the second process: poses in qpos.npy of model.xml become frames.npy (n, height, width, 3)."""
+    """Draw the poses in qpos.npy of model.xml as frames.npy (n, height, width, 3); called in the second process."""
     model = mujoco.MjModel.from_xml_path(str(Path(folder, "model.xml")))
     data, frames = mujoco.MjData(model), []
     with mujoco.Renderer(model, int(height), int(width)) as renderer:
@@ -119,7 +120,7 @@ def render(folder, width, height):
 
 
 def place(model, data, qpos):
-    """Set a pose and compute where everything is."""
+    """Set a pose and compute the positions of bodies, cameras and lights."""
     data.qpos[:] = qpos
     mujoco.mj_kinematics(model, data)
     mujoco.mj_comPos(model, data)
@@ -127,7 +128,7 @@ def place(model, data, qpos):
 
 
 def stick_figure(model, data, qpos):
-    """Bodies joined to their parents as seen from the right side, with the ground line. Returns an Image."""
+    """Image of a pose from the right side: lines from bodies to their parents, and the ground."""
     import matplotlib
 
     matplotlib.use("Agg")

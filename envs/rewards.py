@@ -1,55 +1,55 @@
 """Reward terms that several tasks use. Each takes true (noise-free) quantities of one environment and returns ().
 
-Terms are unweighted and per second: a task multiplies them by its weights and by the control step.
+Terms are unweighted and per second. `Env.step` multiplies them by the task's weights and by the control step.
 """
 
 import jax.numpy as jnp
 
 
 def track_lin_vel(command, lin_vel):
-    """Commanded minus actual horizontal velocity, (2,) each [m/s], through a Gaussian kernel of width 0.5 m/s."""
+    """Gaussian kernel of width 0.5 m/s on the error of the horizontal velocity, (2,) each [m/s]."""
     return jnp.exp(-jnp.sum((command - lin_vel) ** 2) / 0.25)
 
 
 def track_yaw_rate(command, yaw_rate):
-    """Commanded minus actual turning rate, () each [rad/s], through a Gaussian kernel of width 0.5 rad/s."""
+    """Gaussian kernel of width 0.5 rad/s on the error of the turning rate, () each [rad/s]."""
     return jnp.exp(-((command - yaw_rate) ** 2) / 0.25)
 
 
 def square(x):
-    """Sum of squares: torques, joint accelerations, action rates, unwanted velocities and tilts."""
+    """Sum of squares, of torques, accelerations, action rates, unwanted velocities or tilts."""
     return jnp.sum(x**2)
 
 
 def air_time(landed_after, threshold, command):
-    """Flight time above a threshold [s], paid when a foot lands; landed_after (F,) [s] is 0 for all other feet."""
+    """Flight time beyond a threshold [s], counted when a foot lands; landed_after (F,) [s] is 0 for other feet."""
     return jnp.sum(jnp.where(landed_after > 0, landed_after - threshold, 0.0)) * moving(command)
 
 
 def hasty_steps(landed_after, threshold):
-    """How much shorter than a threshold [s] a flight was, when the foot lands; landed_after (F,) [s]."""
+    """Flight time missing to a threshold [s], counted when a foot lands; landed_after (F,) [s] as in `air_time`."""
     return jnp.sum(jnp.where(landed_after > 0, jnp.maximum(threshold - landed_after, 0.0), 0.0))
 
 
 def single_stance(air_time, contact_time, command):
-    """Biped gait: how long this leg swings and the other stands, at most 0.4 s; 0 in flight or on both feet."""
+    """Time [s] for which one foot of a biped has stood and the other swung, at most 0.4; 0 on both feet or none."""
     contact = contact_time > 0
     phase = jnp.where(contact, contact_time, air_time)
     return jnp.where(jnp.sum(contact) == 1, jnp.minimum(jnp.min(phase), 0.4), 0.0) * moving(command)
 
 
 def one_foot(contact, command):
-    """1 while exactly one foot is on the ground and the command moves: pays a biped from its first short step on."""
+    """1 while exactly one foot is on the ground and the command moves. It rewards even a biped's shortest steps."""
     return (jnp.sum(contact) == 1) * moving(command)
 
 
 def flight(contact, command):
-    """1 while no foot is on the ground although the command moves: a hop, where a walk is wanted; contact (F,)."""
+    """1 while no foot is on the ground and the command moves: a hop instead of a walk; contact (F,)."""
     return jnp.all(~contact) * moving(command)
 
 
 def moving(command):
-    """1 if the command asks for more than 0.1 m/s, else 0: standing still must not be punished for lack of steps."""
+    """1 if the command asks for more than 0.1 m/s, else 0, so that standing still needs no steps."""
     return jnp.linalg.norm(command[:2]) > 0.1
 
 
@@ -59,10 +59,10 @@ def slip(foot_vel, contact):
 
 
 def touching(force):
-    """Number of bodies that bear more than 1 N; force (B, 3)."""
+    """Number of bodies with a contact force above 1 N; force (B, 3)."""
     return jnp.sum(jnp.linalg.norm(force, axis=-1) > 1.0)
 
 
 def beyond(joint_pos, low, high):
-    """Joint angle outside soft limits, summed [rad]."""
+    """Sum of joint angles beyond their limits [rad]."""
     return jnp.sum(jnp.maximum(low - joint_pos, 0) + jnp.maximum(joint_pos - high, 0))

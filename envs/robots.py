@@ -1,6 +1,6 @@
-"""The three robots: joint order, default pose, gains' action scale, feet and mirror symmetries.
+"""The three robots: joint order, default pose, action scale, feet and mirror symmetries.
 
-A robot's masses, shapes and PD gains are in its MJCF under assets/; what a policy must know besides is here.
+Masses, shapes and PD gains are in the robot's MJCF under assets/.
 Legend: A joints (and actions), F feet.
 """
 
@@ -19,23 +19,24 @@ AXIAL = {"left_right": np.array([-1, 1, -1]), "front_back": np.array([1, -1, -1]
 
 @dataclass(frozen=True)
 class Robot:
-    """What a policy needs to know of a robot. Every (A,) tuple follows `joints`, the actuator order of the MJCF."""
+    """Facts about a robot beside its MJCF. Tuples (A,) follow `joints`, the actuator order of the MJCF."""
 
     name: str  # also the file assets/<name>.xml
     joints: tuple[str, ...]
-    axes: str  # (A,) letters x, y or z: each joint's axis in the base frame at q = 0
-    default_pose: tuple[float, ...]  # (A,) [rad] what action zero commands
-    action_scale: float  # [rad] of joint target a unit of action
+    axes: str  # (A,) letters x, y or z: axis of each joint in the base frame at q = 0
+    default_pose: tuple[float, ...]  # (A,) [rad] joint targets of action zero
+    action_scale: float  # [rad] change of the joint target per unit of action
     feet: tuple[str, ...]  # (F,) sites; sensors <foot>_pos, <foot>_vel and <foot>_force
-    sole: float  # [m] from a foot's site down to the ground it stands on
-    mirrors: dict[str, dict[str, str]]  # symmetry -> which name parts it exchanges
+    sole: float  # [m] height of a foot's site above the ground it stands on
+    mirrors: dict[str, dict[str, str]]  # symmetry -> first part of a name -> its image
 
     @property
     def xml(self):
+        """Path of the MJCF."""
         return ASSETS / f"{self.name}.xml"
 
     def exchange(self, mirror, name):
-        """The joint or foot that `name` becomes in a mirror."""
+        """Name of the joint or foot that is the mirror image of `name`."""
         parts = self.mirrors[mirror]
         for part, other in parts.items():
             if name.startswith(part):
@@ -48,12 +49,12 @@ class Robot:
         return np.array(perm), np.array([AXIAL[mirror]["xyz".index(axis)] for axis in self.axes])
 
     def mirror_feet(self, mirror):
-        """perm (F,) of the feet."""
+        """perm (F,): mirrored[i] = original[perm[i]], for feet."""
         return np.array([self.feet.index(self.exchange(mirror, foot)) for foot in self.feet])
 
 
 def pairs(*names):
-    """('LF', 'RF') -> {'LF': 'RF', 'RF': 'LF'}, over consecutive pairs."""
+    """Map each name to the other of its pair: ('LF', 'RF') -> {'LF': 'RF', 'RF': 'LF'}."""
     return {a: b for i in range(0, len(names), 2) for a, b in (names[i : i + 2], names[i : i + 2][::-1])}
 
 
@@ -72,8 +73,8 @@ ANYMAL_D = Robot(
     },
 )
 
-# Pose: MuJoCo Menagerie's "home". Front-back is no symmetry here: all knees bend the same way.
-# Deviation: Isaac Lab's pose (thighs 0.8 and 1.0, calves -1.5) lets the hind feet trail; see README.
+# Pose: MuJoCo Menagerie's "home". Front-back is no symmetry here, since all knees bend the same way.
+# Deviation (Go1 pose): Isaac Lab's (thighs 0.8 and 1.0, calves -1.5) lets the hind feet trail.
 GO1 = Robot(
     name="go1",
     joints=tuple(f"{leg}_{joint}_joint" for leg in ("FR", "FL", "RR", "RL") for joint in ("hip", "thigh", "calf")),

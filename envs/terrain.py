@@ -1,7 +1,7 @@
-"""The ground a robot stands on, added to its MJCF: a plane, a field of Perlin noise, or slabs on mocap bodies.
+"""The ground, added to a robot's MJCF: a plane, a field of Perlin noise beside it, or slabs on mocap bodies.
 
-Contact masks: ground contype 0, conaffinity 1; robot contype 1, conaffinity 0. Without them MJX collides floor
-and obstacles with each other and throws bodies into the air.
+Contact masks are contype 0, conaffinity 1 for the ground and the reverse for the robot. Without them MJX collides
+floor and obstacles with each other, and bodies fly off.
 """
 
 from dataclasses import dataclass
@@ -12,26 +12,28 @@ import numpy as np
 
 
 def flat_scene(robot, visual=False):
-    """MjSpec of a robot on a plane at z = 0; `visual` keeps the geoms that only a renderer needs."""
+    """MjSpec of a robot on a plane at z = 0; `visual` adds what only a renderer needs."""
     spec = mujoco.MjSpec.from_file(str(robot.xml))
     world = spec.worldbody
     world.add_geom(
         name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 0.1], contype=0, conaffinity=1
-    )  # its friction never counts: the robot's geoms have priority
+    )  # its friction has no effect: the robot's geoms have priority
     if visual:
         decorate(spec)
     else:
         for geom in [geom for geom in spec.geoms if geom.group == 2]:
-            spec.delete(geom)  # their poses would be computed in every physics step
+            spec.delete(geom)  # visual geoms would cost time in every physics step
     return spec
 
 
-ROUGH_CENTRE, ROUGH_HALF, CELL = 15.0, 8.0, 0.1  # [m] the field lies at (ROUGH_CENTRE, 0); its half-width; its grid
+ROUGH_CENTRE, ROUGH_HALF, CELL = 15.0, 8.0, 0.1  # [m] x of the rough field's middle, its half-width, its grid
 
 
 def perlin(cells, period, rng):
-    """Gradient noise of one octave, about within 0.7 (Perlin 1985): (cells + 1, cells + 1), a lattice point every
-    `period` cells."""
+    """One octave of gradient noise (cells + 1, cells + 1), about within 0.7 (Perlin 1985).
+
+    A lattice point lies every `period` cells.
+    """
     lattice = rng.uniform(0, 2 * np.pi, (cells // period + 2, cells // period + 2))
     position = np.arange(cells + 1) / period
     corner, inside = position.astype(int), position % 1
@@ -46,15 +48,15 @@ def perlin(cells, period, rng):
 
 
 def perlin_heights(amplitude):
-    """Heights [m] of the rough field (rows along y, columns along x): 0 to 2 amplitude, 0 at the border."""
+    """Heights [m] of the rough field, 0 to 2 amplitude, 0 at the border. Rows are along y, columns along x."""
     rng, cells = np.random.default_rng(0), round(2 * ROUGH_HALF / CELL)
     noise = perlin(cells, 10, rng) + 0.5 * perlin(cells, 5, rng)
-    ramp = np.clip(np.minimum(np.arange(cells + 1), np.arange(cells + 1)[::-1]) / 10, 0, 1)  # over 1 m
+    ramp = np.clip(np.minimum(np.arange(cells + 1), np.arange(cells + 1)[::-1]) / 10, 0, 1)  # within 1 m of the border
     return amplitude * np.clip(1 + noise, 0, 2) * np.minimum.outer(ramp, ramp)
 
 
 def rough_scene(robot, heights, visual=False):
-    """The flat scene with a field of `heights` (see perlin_heights) beside it."""
+    """The flat scene with a field of `heights` from perlin_heights beside it."""
     spec = flat_scene(robot, visual)
     top = heights.max()
     spec.add_hfield(
@@ -75,17 +77,20 @@ def rough_scene(robot, heights, visual=False):
     return spec
 
 
+PARKED = -50.0  # [m] height of a slab that is not used
+
+
 @dataclass(frozen=True)
 class Slab:
-    """A box of fixed size on a mocap body of its own; difficulty only moves it, so one model serves all levels."""
+    """A box of fixed size on a mocap body. Levels only move it, so one compiled model serves all of them."""
 
     name: str
     half: tuple[float, float, float]  # [m]
-    ceiling: bool = False  # hangs overhead: part of the ceiling scan, not of the height scan
+    ceiling: bool = False  # seen by the ceiling scan in place of the height scan
 
 
 def slab_scene(robot, slabs, floor=0.0, visual=False):
-    """The flat scene with its plane at height `floor` and these slabs, parked out of the way."""
+    """The flat scene with its plane at height `floor`, and the slabs, parked out of reach."""
     spec = flat_scene(robot, visual)
     spec.geom("floor").pos = [0, 0, floor]
     colours = ([0.55, 0.5, 0.42, 1], [0.48, 0.44, 0.38, 1])
@@ -99,37 +104,34 @@ def slab_scene(robot, slabs, floor=0.0, visual=False):
             conaffinity=1,
             rgba=[0.3, 0.45, 0.6, 0.6] if slab.ceiling else colours[i % 2],
         )
-    if visual:  # from outside of the slabs; where one hangs overhead, from below it
+    if visual:  # place the camera outside of the slabs, or below one that hangs overhead
         camera, below = spec.camera("track"), any(slab.ceiling for slab in slabs)
         camera.pos = [0.6, -4.0, 0.0 if below else 1.8]
         camera.alt.xyaxes = [1, 0, 0, 0, 0, 1] if below else [1, 0, 0, 0, 0.39, 0.92]
     return spec
 
 
-PARKED = -50.0  # [m] height of a slab that is not used
-
-
 def top_heights(pos, quat, half, xy, floor):
-    """Height [m] of the ground at xy (..., 2): the highest slab top there, or the floor.
+    """Height [m] of the ground at xy (..., 2): the top face of the highest slab there, or the floor.
 
-    pos (M, 3) and quat (M, 4) of slabs that are turned about y at most, half (M, 3). Only top faces count.
+    pos (M, 3), quat (M, 4) and half (M, 3) are of slabs that may be tilted about y alone.
     """
     sine, cosine = 2 * quat[:, 0] * quat[:, 2], 1 - 2 * quat[:, 2] ** 2  # of the tilt
     top = pos + half[:, 2:] * jnp.stack([sine, jnp.zeros_like(sine), cosine], -1)  # middle of the top face
-    away = xy[..., None, :] - top[:, :2]  # (..., M, 2)
-    inside = (jnp.abs(away[..., 0]) <= half[:, 0] * cosine) & (jnp.abs(away[..., 1]) <= half[:, 1])
-    height = top[:, 2] - away[..., 0] * sine / cosine
+    offset = xy[..., None, :] - top[:, :2]  # (..., M, 2)
+    inside = (jnp.abs(offset[..., 0]) <= half[:, 0] * cosine) & (jnp.abs(offset[..., 1]) <= half[:, 1])
+    height = top[:, 2] - offset[..., 0] * sine / cosine
     return jnp.max(jnp.where(inside, height, floor), -1, initial=floor)
 
 
 def underside_heights(pos, half, xy):
-    """Height [m] of the lowest ceiling slab over xy (..., 2), infinite where there is none; pos and half (M, 3)."""
+    """Height [m] of the lowest slab's underside over xy (..., 2), infinite if there is none; pos and half (M, 3)."""
     inside = jnp.all(jnp.abs(xy[..., None, :] - pos[:, :2]) <= half[:, :2], -1) & (pos[:, 2] > PARKED / 2)
     return jnp.min(jnp.where(inside, pos[:, 2] - half[:, 2], jnp.inf), -1, initial=jnp.inf)
 
 
 def decorate(spec):
-    """Checkered floor, sky and light, for pictures."""
+    """Add a checkered floor, a sky and a light."""
     texture, builtin = mujoco.mjtTexture, mujoco.mjtBuiltin
     spec.add_texture(
         name="sky",

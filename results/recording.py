@@ -1,23 +1,22 @@
-"""Train a task, evaluate it, and keep the small files of the run: what tasks.py and study.py share."""
+"""Train a task, evaluate its policy and copy the run's small files, for tasks.py and study.py."""
 
-import shutil
 import signal
 import subprocess
 import sys
 from pathlib import Path
 
-from envs import records
+from experiment import records
 
 ROOT = Path(__file__).resolve().parent.parent
 
 
-def finetune(words, log=None, seconds=None):
-    """Run ppo_finetune.py with these arguments; its output goes to the open file `log`, else to the terminal.
+def run_script(words, log=None, seconds=None):
+    """Run a script with its arguments. Output goes to the open file `log`, else to the terminal.
 
-    After `seconds` it is asked to stop, as when this process is. Returns whether it came to its end by itself.
+    After `seconds`, or when this process is stopped, the script is asked to stop. Returns True if it ended by itself.
     UserError if it fails.
     """
-    process = subprocess.Popen([sys.executable, "ppo_finetune.py", *words], cwd=ROOT, stdout=log, stderr=log)
+    process = subprocess.Popen([sys.executable, *words], cwd=ROOT, stdout=log, stderr=log)
     try:
         code = process.wait(seconds)
     except subprocess.TimeoutExpired:
@@ -28,13 +27,18 @@ def finetune(words, log=None, seconds=None):
             process.wait()
     if code:
         where = f"; see {log.name}" if log else ""
-        raise records.UserError(f"ppo_finetune.py {' '.join(words)} ended with exit code {code}{where}")
+        raise records.UserError(f"{' '.join(words)} ended with exit code {code}{where}")
     return True
 
 
-def evaluate(task, run, kept, names, log=None):
-    """Evaluate the policy of runs/<run> and copy the files `names` of it to the folder `kept`."""
-    finetune(["--task", task, "--eval", f"runs/{run}/policy.msgpack"], log)
-    kept.mkdir(parents=True, exist_ok=True)
+def finetune(words, log=None, seconds=None):
+    """`run_script` for ppo_finetune.py."""
+    return run_script(["ppo_finetune.py", *words], log, seconds)
+
+
+def evaluate(run, folder, names, log=None):
+    """Evaluate the policy of runs/<run>, and copy the files `names` of the run to `folder`."""
+    run_script(["play.py", f"runs/{run}/policy.msgpack"], log)
+    folder.mkdir(parents=True, exist_ok=True)
     for name in names:
-        shutil.copy(ROOT / "runs" / run / name, kept / name)
+        records.replace_bytes(folder / name, (ROOT / "runs" / run / name).read_bytes())

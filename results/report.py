@@ -1,15 +1,14 @@
-"""Turn the runs under results/study into the paper's tables and figures: results/README.md, and the project's README.
+"""Turn the recorded runs under results/study into the paper's tables and figures.
 
     python results/report.py
     python results/report.py --check
     python results/report.py --beside runs/demo
     python results/report.py --live runs/demo
 
+Writes results/README.md, the figures it shows, and the table in the project's README.
 The indicator of a task is the paper's: mean return of the noisy policy, for parkour the curriculum's progress. Final
-performance is its mean over the last 5% of rows; iterations to converge, the first at which it reaches 90% of PIDM
-random's final performance; both are percentages against PIDM random. Brackets are 95% bootstrap intervals over seeds.
---check fails if a page on disk is not what the runs give; --beside draws a run of yours with the recorded ones of its
-task; --live redraws the curve.png of a run of ppo_explore.py or ppo_finetune.py while it goes on.
+performance is its mean over the last 5% of rows. Iterations to converge are those to 90% of PIDM random's final
+performance. Both are percentages against PIDM random. Brackets are 95% bootstrap intervals over seeds.
 """
 
 import csv
@@ -25,38 +24,11 @@ import tyro
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 
-from envs import records
+from experiment import figures, records
+from results.grid import METHODS, TASKS, titles
 
 STUDY = ROOT / "results/study"
-DISCUSSION = ROOT / "results/discussion.md"  # written by hand, stands at the head of the page
-TASKS = {  # in the paper's order
-    "anymal_loco": "ANYmal D locomotion",
-    "anymal_pedipulation": "Pedipulation",
-    "anymal_parkour_walk": "Parkour walk",
-    "anymal_climb_up": "Climb up",
-    "anymal_climb_down": "Climb down",
-    "anymal_crouch": "Crouch",
-    "anymal_jump": "Jump",
-    "go1_loco": "Go1 locomotion",
-    "g1_loco": "G1 locomotion",
-}
-METHODS = {
-    "mlp": "MLP",
-    "pidm_random": "PIDM random",
-    "pidm_pretrained": "PIDM pretrained",
-    "pidm_shuffled": "PIDM shuffled",
-    "pidm_actor": "PIDM pretrained, actor only",
-    "pidm_critic": "PIDM pretrained, critic only",
-    "pidm_7k": "PIDM pretrained on 7 k",
-    "pidm_70k": "PIDM pretrained on 70 k",
-    "pidm_700k": "PIDM pretrained on 700 k",
-    "mlp_orthogonal": "MLP, orthogonal",
-    "pidm_random_orthogonal": "PIDM random, orthogonal",
-    "pidm_pretrained_orthogonal": "PIDM pretrained, orthogonal",
-    "pidm_history_orthogonal": "PIDM pretrained, history encoder only, orthogonal",
-    "pidm_scaled": "PIDM pretrained, scaled",
-    "pidm_slow": "PIDM pretrained, slow start",
-}
+DISCUSSION = ROOT / "results/discussion.md"  # written by hand; a part of the page
 PAPER = {  # measure -> method -> percent against PIDM random by task, in the order of TASKS; Tables I and II
     "final": {
         "mlp": (0.5, 0.2, -0.8, -3.7, -0.3, 1.8, 11.1, 0.6, -0.2),
@@ -76,21 +48,21 @@ DRAWS = 10_000  # bootstrap samples
 
 @dataclass(frozen=True)
 class Args:
-    check: bool = False  # compare with the pages on disk instead of writing them
-    beside: str | None = None  # a run folder: draw its curve with those of the study
-    live: str | None = None  # a run folder: redraw its curve.png every ten seconds until it has made its steps
+    check: bool = False  # write nothing; fail if a page on disk is not what the runs give
+    beside: str | None = None  # a run's folder: draw its curve with the recorded ones of its task
+    live: str | None = None  # a run's folder: redraw its curve.png every ten seconds until the run is complete
 
 
 # --- Runs ---
 
 
 def left_out(folder, why):
-    """Say that a run is not counted, and why."""
+    """Print a warning that a run is not counted."""
     print(f"warning: {folder.relative_to(ROOT)} left out: {why}", file=sys.stderr)
 
 
 def load_run(folder):
-    """One run: its columns, each (R,), its evaluation and settings; None, with a warning, if it is not whole."""
+    """One run: its columns, each (R,), its evaluation and settings. None, with a warning, if it is incomplete."""
     try:
         record = json.loads((folder / "args.json").read_text())
         result = json.loads((folder / "eval.json").read_text())
@@ -116,18 +88,18 @@ def load_run(folder):
 
 
 def load_task(folder):
-    """method -> runs by seed. Runs whose settings differ from the first one's are left out with a warning."""
+    """Runs of each method, by seed. Runs whose settings differ from the first one's are left out with a warning."""
     runs, settings = {}, None
     for method in METHODS:
         for seed in sorted((folder / method).glob("seed*")):
-            one = load_run(seed)
-            if one is None:
+            run = load_run(seed)
+            if run is None:
                 continue
-            settings = settings or one["settings"]
-            if one["settings"] != settings:
+            settings = settings or run["settings"]
+            if run["settings"] != settings:
                 left_out(seed, "other settings than the rest")
                 continue
-            runs.setdefault(method, []).append(one)
+            runs.setdefault(method, []).append(run)
     return runs
 
 
@@ -140,7 +112,7 @@ def final(run):
 
 
 def late_gain(run):
-    """Share of the final performance that the last third of the training brought: near 0 once the curve is flat."""
+    """Share of the final performance gained in the last third of the training: near 0 once the curve is flat."""
     rows = len(run["indicator"])
     end, width = max(2 * rows // 3, 1), max(rows // 20, 1)
     return 1 - run["indicator"][end - width : end].mean() / final(run)
@@ -160,7 +132,7 @@ def iterations_to(run, level):
 
 
 def measures(runs):
-    """Name -> function of a run; levels are those of PIDM random's final performance."""
+    """Functions of a run, by name; levels are shares of PIDM random's final performance."""
     goal = np.mean([final(run) for run in runs["pidm_random"]])
     return {
         "final": final,
@@ -171,7 +143,7 @@ def measures(runs):
 
 
 def percent(values, baseline):
-    """Percent of mean(values) against mean(baseline), and DRAWS of it with seeds of both drawn anew."""
+    """Percentage of mean(values) against mean(baseline), and DRAWS bootstrap samples of it."""
     values, baseline = np.asarray(values), np.asarray(baseline)
     rng = np.random.default_rng(0)
     draws = [rng.choice(x, (DRAWS, len(x))).mean(1) for x in (values, baseline)]
@@ -179,16 +151,16 @@ def percent(values, baseline):
 
 
 def interval(middle, draws):
-    """A percentage with its 95% interval; without, where all draws are one."""
+    """A percentage as text, with its 95% interval unless all draws are equal."""
     if np.ptp(draws) == 0:
         return f"{middle:+.1f}"
     return f"{middle:+.1f} [{np.quantile(draws, 0.025):+.1f}, {np.quantile(draws, 0.975):+.1f}]"
 
 
 def compare(runs, method, name, at_least=False):
-    """Percent of one measure against PIDM random with draws; or words, where there is none.
+    """Percentage of one measure against PIDM random, with draws, or words if there is none.
 
-    With at_least, runs that never reach a level count as if they did at their last iteration.
+    With at_least, a run that never reaches a level counts as if it did at its last iteration.
     """
     if method not in runs or "pidm_random" not in runs:
         return "not run"
@@ -209,7 +181,7 @@ def cell(runs, method, name):
 
 
 def paper(method, name, task):
-    """The paper's percentage as text, empty where it has none."""
+    """The paper's percentage as text, empty if it has none."""
     known = dict(zip(TASKS, PAPER[name].get(method, ()), strict=False)).get(task)
     return "" if known is None else f"{known:+.1f}"
 
@@ -218,13 +190,13 @@ def paper(method, name, task):
 
 
 def markdown(rows):
-    """Lines of a table from rows, dicts of the same columns. Trailing blanks tell columns of one title apart."""
+    """Lines of a table from rows, dicts of the same columns. Trailing blanks, which tell titles apart, are dropped."""
     lines = [list(rows[0]), ["---"] * len(rows[0]), *(row.values() for row in rows)]
     return ["| " + " | ".join(cell.strip() for cell in line) + " |" for line in lines]
 
 
 def seeds(runs, methods):
-    """How many seeds each of these methods has."""
+    """Number of seeds of each of these methods, or one number if they agree."""
     counts = [len(runs.get(method, ())) for method in methods]
     return str(counts[0]) if len(set(counts)) == 1 else " / ".join(map(str, counts))
 
@@ -237,7 +209,7 @@ def table_1(study, tasks=tuple(TASKS)):
     rows = []
     for task in tasks:
         runs = study.get(task, {})
-        row = {"task": TASKS[task], "seeds": seeds(runs, ("mlp", "pidm_random", "pidm_pretrained"))}
+        row = {"task": TASKS[task].title, "seeds": seeds(runs, ("mlp", "pidm_random", "pidm_pretrained"))}
         for i, (head, method, name) in enumerate(columns):
             row |= {head: cell(runs, method, name), "paper" + " " * i: paper(method, name, task)}
         rows.append(row)
@@ -250,9 +222,9 @@ def table_1(study, tasks=tuple(TASKS)):
 
 
 def mean_over_tasks(study, method, name):
-    """Mean percentage with its interval as text, "at least" where a run never got there; and the tasks it is of.
+    """Mean percentage with its interval as text, "at least" if a run never got there; and the tasks that it is of.
 
-    These have several seeds of both methods: one seed says nothing of how sure the mean is.
+    These have several seeds of both methods, for one seed gives no interval.
     """
     several = [t for t, runs in study.items() if all(len(runs.get(m, ())) > 1 for m in (method, "pidm_random"))]
     found = {task: compare(study[task], method, name, at_least=True) for task in several}
@@ -265,17 +237,17 @@ def mean_over_tasks(study, method, name):
 
 
 def along_the_way(study):
-    """Not in the paper: iterations to half of PIDM random's final performance, and the mean of the whole training."""
+    """Iterations to half of PIDM random's final performance, and the mean of the whole training (not in the paper)."""
     methods = {"mlp": "MLP", "pidm_pretrained": "pretrained"}
     names = {"to 50%": "iterations to 50%", "area": "mean of the training"}
     columns = [(f"{title}: {label} [%]", m, n) for n, title in names.items() for m, label in methods.items()]
     ran = {task: runs for task, runs in study.items() if "pidm_random" in runs}
-    rows = [{"task": TASKS[t]} | {head: cell(r, m, n) for head, m, n in columns} for t, r in ran.items()]
+    rows = [{"task": TASKS[t].title} | {head: cell(r, m, n) for head, m, n in columns} for t, r in ran.items()]
     return markdown(rows) if rows else []
 
 
 def ablation(study, methods, tasks):
-    """Final performance and iterations of `methods` (name -> title), a row each, for each task, as are the seeds."""
+    """Final performance, iterations and seeds on each task; a row for each of `methods` (name -> title)."""
     rows = []
     for method, title in methods.items():
         row = {"method": title, "seeds": " / ".join(str(len(study.get(task, {}).get(method, ()))) for task in tasks)}
@@ -283,7 +255,7 @@ def ablation(study, methods, tasks):
             runs = study.get(task, {})
             for j, name in enumerate(("final", "to 90%")):
                 what = "final" if name == "final" else "iterations"
-                row[f"{TASKS[task]}: {what} [%]"] = cell(runs, method, name)
+                row[f"{TASKS[task].title}: {what} [%]"] = cell(runs, method, name)
                 row["paper" + " " * (2 * i + j)] = paper(method, name, task)
         rows.append(row)
     empty = [column for column in rows[0] if not any(row[column] for row in rows)]  # the paper has no such runs
@@ -291,14 +263,14 @@ def ablation(study, methods, tasks):
 
 
 def details(runs):
-    """Lines of two tables about one task: every method in absolute figures; its mean action, step size and noise."""
+    """Lines of two tables of one task: every method in absolute figures; its mean action, step size and noise."""
     functions = measures(runs) if "pidm_random" in runs else {"final": final, "area": area}
     progress, ends = [], []
     for method, mine in runs.items():
         values = {name: [function(run) for run in mine] for name, function in functions.items()}
         last = {name: np.mean([run["columns"][name][-1] for run in mine]) for name in ("action_std", "seconds")}
         row = {
-            "method": METHODS[method],
+            "method": METHODS[method].title,
             "seeds": ", ".join(str(run["seed"]) for run in mine),
             "final": spread(values["final"]),
             "of it in the last third [%]": f"{100 * np.mean([late_gain(run) for run in mine]):.0f}",
@@ -307,7 +279,7 @@ def details(runs):
             "iterations to 90%": counts(values["to 90%"]) if "to 90%" in values else "no PIDM random",
         }
         progress.append(row | {"minutes": f"{last['seconds'] / 60:.1f}"})
-        row = {"method": METHODS[method]}
+        row = {"method": METHODS[method].title}
         for name in sorted(mine[0]["errors"].keys() - {"diverged"}):
             row[f"mean action: {name}"] = f"{np.mean([run['errors'][name] for run in mine]):.3g}"
         if mine[0]["success"]:
@@ -325,12 +297,12 @@ def details(runs):
 
 
 def spread(values):
-    """Mean and std over seeds; a single seed has no std."""
+    """Mean and std over seeds as text; a single seed has no std."""
     return f"{np.mean(values):.4g}" + (f" ± {np.std(values):.2g}" if len(values) > 1 else "")
 
 
 def counts(values):
-    """Mean of iteration counts, NaN where a level was not reached, and how many did where not all."""
+    """Mean of iteration counts as text, and how many are not NaN, unless all are. NaN: level not reached."""
     reached = np.isfinite(values)
     if not reached.any():
         return "not reached"
@@ -338,7 +310,7 @@ def counts(values):
 
 
 def pidm_table():
-    """Error of each robot's shipped PIDM on held-out data, beside what the paper reads off its Fig. 4c for ANYmal D."""
+    """Error of each robot's shipped PIDM on held-out data, beside that of the paper's Fig. 4c for ANYmal D."""
     names = {"error_rad": "error [rad]", "error_over_change": "over the action magnitude"}
     rows = []
     for robot in ("anymal_d", "go1", "g1"):
@@ -352,69 +324,64 @@ def pidm_table():
 
 
 def panels(count, width=3):
-    """pyplot, a figure, and `count` axes in rows of at most `width`."""
-    plt = records.pyplot()
+    """A figure and `count` axes, in rows of at most `width`."""
     columns = min(count, width)
     rows = -(-count // columns)
-    fig, axes = plt.subplots(rows, columns, figsize=(5 * columns, 3.4 * rows), constrained_layout=True, squeeze=False)
+    size = 5 * columns, 3.4 * rows
+    fig, axes = figures.pyplot().subplots(rows, columns, figsize=size, constrained_layout=True, squeeze=False)
     for ax in axes.ravel()[count:]:
         ax.axis("off")
-    return plt, fig, axes.ravel()[:count]
-
-
-def save(plt, fig, path):
-    fig.savefig(path, dpi=100, metadata={"Software": None})
-    plt.close(fig)
+    return fig, axes.ravel()[:count]
 
 
 def look_of(method):
-    """Colour and line of a method: the same in every panel, dashed where only its first weights differ."""
+    """Colour and line of a method: the same in every panel, dashed if only its initial weights differ."""
     bases = list(dict.fromkeys(name.removesuffix("_orthogonal") for name in METHODS))
     base = method.removesuffix("_orthogonal")
     return {"color": f"C{bases.index(base) % 10}", "linestyle": "-" if base == method else "--"}
 
 
 def draw_curves(study, path, extra=None):
-    """Mean and std of the indicator over iterations, a panel a task; `extra` (label, iteration, value) goes on top."""
-    plt, fig, axes = panels(len(study))
+    """Mean and std of the indicator over iterations, a panel per task. `extra` (label, iteration, value) is on top."""
+    fig, axes = panels(len(study))
     for ax, (task, runs) in zip(axes, study.items(), strict=True):
         for method, mine in runs.items():
             values = np.stack([run["indicator"] for run in mine])
             iteration, mean, std = mine[0]["iteration"], values.mean(0), values.std(0)
-            ax.plot(iteration, mean, label=f"{METHODS[method]} ({len(mine)})", **look_of(method))
+            ax.plot(iteration, mean, label=f"{METHODS[method].title} ({len(mine)})", **look_of(method))
             ax.fill_between(iteration, mean - std, mean + std, alpha=0.15, color=look_of(method)["color"], linewidth=0)
         if extra:
             ax.plot(*extra[1:], color="black", label=extra[0])
         parkour = "progress" in next(iter(runs.values()))[0]["columns"]
-        ax.set(title=TASKS[task], xlabel="PPO iteration", ylabel="progress" if parkour else "episode return")
+        ax.set(title=TASKS[task].title, xlabel="PPO iteration", ylabel="progress" if parkour else "episode return")
         ax.grid(alpha=0.3)
         ax.legend(fontsize=8)
-    save(plt, fig, path)
+    figures.save(fig, path, dpi=100)
 
 
 def draw_updates(study, path):
-    """Paper Fig. 6: mean change of a weight of the actor in an iteration, by submodule, random against pretrained."""
+    """Paper Fig. 6: mean change of a weight of the actor per iteration, by submodule, random against pretrained."""
     methods = {"pidm_random": "--", "pidm_pretrained": "-"}
     known = {task: runs for task, runs in study.items() if all(m in runs for m in methods)}
     if not known:
         return False
-    plt, fig, axes = panels(len(known))
+    fig, axes = panels(len(known))
     for ax, (task, runs) in zip(axes, known.items(), strict=True):
         names = [name for name in runs["pidm_random"][0]["columns"] if name.startswith("update/actor/")]
         for i, name in enumerate(names):
             for method, style in methods.items():
                 mean = np.mean([run["columns"][name] for run in runs[method]], axis=0)
-                label = f"{name.removeprefix('update/actor/')}, {METHODS[method].removeprefix('PIDM ')}"
+                label = f"{name.removeprefix('update/actor/')}, {METHODS[method].title.removeprefix('PIDM ')}"
                 ax.semilogy(runs[method][0]["iteration"], mean, style, color=f"C{i}", label=label, linewidth=1)
-        ax.set(title=TASKS[task], xlabel="PPO iteration", ylabel="mean change of a weight")
+        ax.set(title=TASKS[task].title, xlabel="PPO iteration", ylabel="mean change of a weight")
         ax.grid(alpha=0.3)
         ax.legend(fontsize=6)
-    save(plt, fig, path)
+    figures.save(fig, path, dpi=100)
     return True
 
 
 def sizes_of(robot):
-    """Transitions pretrained on -> normalised error on held-out ones, of what results/pidm.py has made."""
+    """Normalised error on held-out transitions, by number of those trained on, of what results/pidm.py has made."""
     folder, found = ROOT / f"results/pidm/{robot}", {}
     for path in [*folder.glob("sizes/*_validation.json"), folder / "validation.json"]:
         stem = path.stem.removesuffix("validation")
@@ -430,26 +397,26 @@ def draw_sizes(study, path, robot="anymal_d"):
     if len(errors) < 2:
         return False
     methods = {7_000: "pidm_7k", 70_000: "pidm_70k", 700_000: "pidm_700k", max(errors): "pidm_pretrained"}
-    plt, fig, (left, right) = panels(2)
+    fig, (left, right) = panels(2)
     left.semilogx(list(errors), list(errors.values()), "o-")
     left.set(xlabel="transitions", ylabel="error over action magnitude")
     for task, runs in study.items():
         known = {count: compare(runs, method, "to 90%") for count, method in methods.items()}
         known = {count: value[0] for count, value in known.items() if not isinstance(value, str)}
         if len(known) > 1:
-            right.semilogx(list(known), list(known.values()), "o-", label=TASKS[task])
+            right.semilogx(list(known), list(known.values()), "o-", label=TASKS[task].title)
     right.set(xlabel="transitions", ylabel="iterations to 90%, against random [%]")
     right.axhline(0.0, color="0.6", lw=1)
     for ax in (left, right):
         ax.grid(alpha=0.3)
     if right.get_legend_handles_labels()[0]:
         right.legend(fontsize=8)
-    save(plt, fig, path)
+    figures.save(fig, path, dpi=100)
     return True
 
 
 def draw_all(study):
-    """Every figure that the runs allow; one that they no longer allow is removed."""
+    """Draw the figures that the runs allow, and remove those that they no longer allow."""
     draw_curves(study, STUDY / "curves.png")
     for draw, name in ((draw_updates, "updates.png"), (draw_sizes, "sizes.png")):
         if not draw(study, STUDY / name):
@@ -461,30 +428,30 @@ def draw_all(study):
 HEAD = """# Results
 
 Written by `python results/report.py` from the runs in [study](study); `--check` compares. Percentages are against PIDM
-random. Final performance is the mean indicator of the last 5% of a training (episode return of the noisy policy;
-parkour: progress of the curriculum), iterations those to 90% of PIDM random's final performance; less is better.
-Brackets are 95% bootstrap intervals over seeds; with few seeds they are rough. A single seed counts as if it had no
-spread: beside it they hold that of PIDM random alone, and where PIDM random has one seed as well there is none. The
-mean is of tasks with several seeds of both and, for iterations, in which every run of PIDM random got to 90%; where it
-says "at least", a run of the other method that never got there counts as if it had in its last iteration.
+random.
+
+- *Final performance* is the mean indicator of the last 5% of a training. The indicator is the episode return of the
+  noisy policy; for parkour, the progress of the curriculum.
+- *Iterations* are those to 90% of PIDM random's final performance; less is better.
+- *Brackets* are 95% bootstrap intervals over seeds, rough if the seeds are few. A single seed counts as if it had no
+  spread, so that the brackets hold that of PIDM random alone. If PIDM random has one seed as well, there are none.
+- *Mean* is over the tasks with several seeds of both methods. For iterations, every run of PIDM random must have
+  reached 90%. With "at least", some run of the other method did not, and counts as if it had in its last iteration.
 """
 BEYOND = """`PIDM shuffled` has the pretrained weights permuted within each layer: the same numbers, no knowledge. Its
 features are 56 to 78% as large as the loaded ones and fill half as many directions again ([features](pidm/README.md),
-with orthogonal weights around both).
-`orthogonal` has orthogonal first weights, our default, where the others have PyTorch's, as rsl_rl, a fork
-of which the paper used.
-`history encoder only` leaves the backbone fresh; `scaled` halves the loaded backbone's output; `slow start` lets
-loaded parts move little in the first 50 iterations.
+with orthogonal weights around both). `orthogonal` has orthogonal initial weights, our default. The others have
+PyTorch's, as rsl_rl, a fork of which the paper used. `history encoder only` loads no backbone.
 """
 PIDM = """Mean error of the shipped checkpoints on a collection that they have not seen. The action magnitude is
-|a_t - q_t|, by how much joint targets differ from where the joints are. The figures are ANYmal D's, as in the paper,
-where most actions are smaller than 1 rad and most errors than 0.4 rad. [pidm](pidm/README.md) has the other robots.
+|a_t - q_t|, joint target minus joint angle. The figures are ANYmal D's, as in the paper, where most actions are smaller
+than 1 rad and most errors than 0.4 rad. [pidm](pidm/README.md) has the other robots.
 """
 BEGIN, END = "<!-- results/report.py writes from here -->", "<!-- to here -->"
 
 
 def load_study(scale):
-    """Task -> runs, in the paper's order, of what was run."""
+    """Runs of each task that has any, in the paper's order."""
     loaded = {task: load_task(STUDY / scale / task) for task in TASKS}
     return {task: runs for task, runs in loaded.items() if runs}
 
@@ -494,9 +461,9 @@ def page(study, updates):
     lines = [HEAD, DISCUSSION.read_text(), "## Table I", "", *table_1(study), "", "![curves](study/curves.png)", ""]
     lines += ["Where the methods stand before they have converged:", "", *along_the_way(study), ""]
     climbing = ("anymal_climb_up", "anymal_climb_down")
-    parts = {m: METHODS[m] for m in ("pidm_actor", "pidm_critic", "pidm_pretrained")}
+    loaded = {"pidm_pretrained": METHODS["pidm_pretrained"].title}
+    parts, sizes = titles("table 2") | loaded, titles("sizes") | loaded
     lines += ["## Table II: which network is pretrained", "", *ablation(study, parts, climbing), ""]
-    sizes = {m: METHODS[m] for m in ("pidm_7k", "pidm_70k", "pidm_700k", "pidm_pretrained")}
     lines += ["## Size of the pretraining set", "", *ablation(study, sizes, climbing), ""]
     errors = sizes_of("anymal_d")
     if len(errors) > 1:
@@ -504,7 +471,7 @@ def page(study, updates):
         lines += ["Error over action magnitude on held-out transitions, by the number of those trained on.", ""]
         lines += ["![sizes](study/sizes.png)", ""]
     ran = set().union(*study.values())
-    beyond = {m: title for m, title in METHODS.items() if m in ran and m not in (*parts, *sizes, "mlp", "pidm_random")}
+    beyond = {method: title for method, title in titles("beyond the paper").items() if method in ran}
     if beyond and any("pidm_random" in runs for runs in study.values()):
         tasks = [task for task, runs in study.items() if beyond.keys() & runs.keys() and "pidm_random" in runs]
         lines += ["## Controls, and what the paper does not have", ""]
@@ -518,12 +485,19 @@ def page(study, updates):
         one = next(iter(runs.values()))[0]
         s, v = one["settings"], one["versions"]
         size = f"{s['num_envs']} x {s['num_steps']}, {s['total_steps'] / 1e6:.1f} M steps"
-        lines += [f"### {TASKS[task]}", "", f"`{task}`, {size}, {v['device']}, {v['machine']}.", "", *details(runs), ""]
+        lines += [
+            f"### {TASKS[task].title}",
+            "",
+            f"`{task}`, {size}, {v['device']}, {v['machine']}.",
+            "",
+            *details(runs),
+            "",
+        ]
     return "\n".join(lines).rstrip() + "\n"
 
 
 def with_table(text, study):
-    """The project's README with the rows of Table I that were run between the marks."""
+    """Text of the project's README, with the rows of Table I that have runs between the two marks."""
     ran = [task for task in TASKS if "pidm_random" in study.get(task, {})]
     missing = ", ".join(f"`{task}`" for task in TASKS if task not in ran)
     lines = ["", *table_1(study, ran), ""] if ran else [""]
@@ -533,7 +507,7 @@ def with_table(text, study):
 
 
 def beside(folder):
-    """Draw a run with the study's of its task into its own folder; UserError if either is missing."""
+    """Draw a run with the recorded ones of its task, in its own folder. UserError if either is missing."""
     try:
         task = json.loads((folder / "args.json").read_text())["task"]
         with (folder / "metrics.csv").open() as file:
@@ -551,31 +525,27 @@ def beside(folder):
 
 
 def live(folder, seconds=10.0):
-    """Redraw curve.png of a run until it has made its steps, or until Ctrl-C; UserError if it is no such run."""
-    import ppo_explore
-    import ppo_finetune
-
-    shown = 0
+    """Redraw curve.png of a run until it has made its steps, or until Ctrl-C. UserError if it is no such run."""
+    drawn = 0
     while True:
         try:
-            record = json.loads((folder / "args.json").read_text())
-            script = {"task": ppo_finetune, "robot": ppo_explore}[next(n for n in ("task", "robot") if n in record)]
+            total = json.loads((folder / "args.json").read_text())["total_steps"]
             with (folder / "metrics.csv").open() as file:
                 rows = [{name: float(value) for name, value in row.items()} for row in csv.DictReader(file)]
-            steps, wanted = rows[-1]["env_steps"], record["total_steps"]
-        except (OSError, ValueError, KeyError, IndexError, StopIteration) as error:
+            steps = rows[-1]["env_steps"]
+        except (OSError, ValueError, KeyError, IndexError) as error:
             raise records.UserError(f"{folder} has no rows of ppo_explore.py or ppo_finetune.py: {error!r}") from None
-        if len(rows) > shown:
-            script.plot(rows, folder / "curve.png")
-            shown = len(rows)
-            print(f"{folder}/curve.png: {steps / 1e6:.2f} of {wanted / 1e6:.2f} M steps", flush=True)
-        if steps >= wanted:
+        if len(rows) > drawn:
+            figures.plot_training(rows, folder / "curve.png")
+            drawn = len(rows)
+            print(f"{folder}/curve.png: {steps / 1e6:.2f} of {total / 1e6:.2f} M steps", flush=True)
+        if steps >= total:
             return
         time.sleep(seconds)
 
 
 def main(args):
-    """Write the pages and figures, or with --check exit 1 where a page differs from the one on disk."""
+    """Write the pages and figures. With --check, exit 1 if a page differs from the one on disk."""
     if args.beside:
         return beside(Path(args.beside))
     if args.live:

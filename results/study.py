@@ -1,16 +1,16 @@
-"""The paper's comparison: tasks x methods x seeds of ppo_finetune.py. Runs what is missing, goes on with what broke.
+"""The paper's comparison: train and evaluate tasks x methods x seeds with ppo_finetune.py, and keep the records.
 
     python results/study.py --status
     python results/study.py --tasks go1_loco --seeds 0 1 2 --budget-minutes 120
     python results/study.py --list | parallel -j 8
 
-A run uses the cores it may. Two at once, each pinned to one of two cores (`taskset -c 0`), make 15 to 25% more steps.
+It trains what is missing and resumes what was interrupted. A run uses the cores it may. Two at once, each pinned to one
+of two cores (`taskset -c 0`), make 15 to 25% more steps.
 
-Without --tasks, --methods and --seeds it is the whole grid: Table I of the paper (nine tasks, three methods, five
-seeds), Table II (actor or critic alone), the sizes of the pretraining set, a control with shuffled weights, and what
-orthogonal first weights, our default, change. A run is trained and evaluated in
-runs/study/<scale>/<task>/<method>/seed<k>; its small files are kept under results/study in the same folders, where
-report.py reads them. Scales never mix.
+Without --tasks, --methods and --seeds it is the whole of grid.py: Table I of the paper (nine tasks, three methods, five
+seeds), Table II (actor or critic alone), the sizes of the pretraining set, and, beyond the paper, shuffled weights and
+orthogonal initial weights. A run is in runs/study/<scale>/<task>/<method>/seed<k>. Its small files are kept in the same
+folder under results, where report.py reads them. Scales never mix.
 """
 
 import csv
@@ -28,56 +28,22 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 
 import envs
-from envs import records
+from experiment import records
 from results import recording
+from results.grid import METHODS, TASKS
 
-PIDM = "assets/pidm/{robot}.msgpack"
-SMALL = "results/pidm/{robot}/sizes/{size}.msgpack"  # made by pidm.py --stages sizes
-PAPER = ("--fresh", "pytorch")  # first weights of what is not loaded: rsl_rl's, a fork of which the paper used
-METHODS = {  # method -> arguments of ppo_finetune.py
-    "mlp": ("--network", "mlp", *PAPER),
-    "pidm_random": ("--network", "pidm", *PAPER),
-    "pidm_pretrained": ("--pretrained", PIDM, *PAPER),
-    "pidm_shuffled": ("--pretrained", PIDM, "--init", "shuffled", *PAPER),
-    "pidm_actor": ("--pretrained", PIDM, "--init", "actor", *PAPER),
-    "pidm_critic": ("--pretrained", PIDM, "--init", "critic", *PAPER),
-    "pidm_7k": ("--pretrained", SMALL.replace("{size}", "7000"), *PAPER),
-    "pidm_70k": ("--pretrained", SMALL.replace("{size}", "70000"), *PAPER),
-    "pidm_700k": ("--pretrained", SMALL.replace("{size}", "700000"), *PAPER),
-    # beyond the paper
-    "mlp_orthogonal": ("--network", "mlp"),
-    "pidm_random_orthogonal": ("--network", "pidm"),
-    "pidm_pretrained_orthogonal": ("--pretrained", PIDM),
-    "pidm_history_orthogonal": ("--pretrained", PIDM, "--core", "history_encoder"),
-    "pidm_scaled": ("--pretrained", PIDM, "--core-scale", "0.5", *PAPER),
-    "pidm_slow": ("--pretrained", PIDM, "--warm-iterations", "50", *PAPER),
-}
-TABLE_1 = ("mlp", "pidm_random", "pidm_pretrained")
-ORTHOGONAL = ("mlp_orthogonal", "pidm_random_orthogonal", "pidm_pretrained_orthogonal", "pidm_history_orthogonal")
-ABLATIONS = ("pidm_actor", "pidm_critic", "pidm_7k", "pidm_70k", "pidm_700k")
-GRID = {  # task -> methods; blind tasks first
-    **dict.fromkeys(("go1_loco", "anymal_loco"), (*TABLE_1, *ORTHOGONAL, "pidm_shuffled")),
-    **dict.fromkeys(("anymal_pedipulation", "g1_loco"), (*TABLE_1, "pidm_shuffled")),
-    **dict.fromkeys(("anymal_climb_up", "anymal_climb_down"), (*TABLE_1, *ABLATIONS, "pidm_shuffled")),
-    **dict.fromkeys(("anymal_crouch", "anymal_jump", "anymal_parkour_walk"), TABLE_1),
-}
 KEPT = ("args.json", "metrics.csv", "eval.json")
-STEPS = {  # of scale cpu, where the preset's would end before the PIDM is done learning, or long after
-    "go1_loco": 6_000_000,
-    "anymal_pedipulation": 6_000_000,
-    "g1_loco": 12_000_000,
-}
 
 
 @dataclass(frozen=True)
 class Args:
-    tasks: tuple[str, ...] = tuple(GRID)
-    methods: tuple[str, ...] | None = None  # None: the task's in the grid
+    tasks: tuple[str, ...] = tuple(TASKS)
+    methods: tuple[str, ...] | None = None  # None: those of each task in grid.py
     seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
     scale: Literal["smoke", "cpu", "gpu"] = "cpu"  # preset
-    budget_minutes: float = 1e9  # then stop; the same command goes on
-    list: bool = False  # print the commands of what is missing, one a line, and stop
-    status: bool = False  # print what is there, and stop
+    budget_minutes: float = 1e9  # stop after this time; the same command goes on
+    list: bool = False  # print one command for each missing run, and train nothing
+    status: bool = False  # print what has been trained, and train nothing
 
 
 @dataclass(frozen=True)
@@ -91,22 +57,22 @@ class Cell:
 
     @property
     def folder(self):
-        """Below runs/ and below results/."""
+        """The run's folder, under runs/ and under results/."""
         return f"study/{self.scale}/{self.task}/{self.method}/seed{self.seed}"
 
     def words(self):
-        """Arguments of ppo_finetune.py: for a new run, or for one that broke."""
+        """Arguments of ppo_finetune.py, for a new run or to resume an interrupted one."""
         run = ROOT / "runs" / self.folder
         if (run / records.STATE).exists():
             return ["--resume", f"runs/{self.folder}"]
-        robot = envs.TASKS[self.task][1].robot
+        robot, steps = envs.TASKS[self.task][1].robot, TASKS[self.task].steps
         words = ["--task", self.task, "--preset", self.scale, "--seed", str(self.seed)]
-        words += [word.format(robot=robot) for word in METHODS[self.method]]
-        words += ["--total-steps", str(STEPS[self.task])] if self.scale == "cpu" and self.task in STEPS else []
+        words += METHODS[self.method].flags.format(robot=robot).split()
+        words += ["--total-steps", str(steps)] if self.scale == "cpu" and steps else []
         return [*words, "--run-dir", f"runs/{self.folder}", "--force"]
 
     def done(self):
-        """Share of its steps that a run has made, 1 if it is kept. None if it never started."""
+        """Share of its steps that the run has made, 1 once its files are kept, None before its first row."""
         if all((ROOT / "results" / self.folder / name).exists() for name in KEPT):
             return 1.0
         run = ROOT / "runs" / self.folder
@@ -119,44 +85,44 @@ class Cell:
 
 
 def cells(args):
-    """Runs in order: one seed of every method before the next seed, so that a stopped study can be compared."""
+    """Runs in order: one seed of every method before the next seed, so that an unfinished study can be compared."""
     for task in args.tasks:
         for seed in args.seeds:
-            for method in args.methods or GRID[task]:
+            for method in args.methods or TASKS[task].methods:
                 yield Cell(args.scale, task, method, seed)
 
 
-def show_status(every):
-    """A line for each task and method: `x` a finished seed, a percentage one that broke, `.` one that never started."""
-    found = {}
-    for cell in every:
+def show_status(runs):
+    """Print a line for each task and method: `x` for a finished seed, a percentage for a part, `.` for none."""
+    marks = {}
+    for cell in runs:
         done = cell.done()
         mark = "." if done is None else "x" if done == 1.0 else f"{100 * done:.0f}%"
-        found.setdefault((cell.task, cell.method), []).append(mark)
-    for (task, method), marks in found.items():
-        print(f"{task:20}{method:28}{' '.join(marks)}")
-    count = sum(marks.count("x") for marks in found.values())
-    print(f"{count} of {sum(map(len, found.values()))} runs")
+        marks.setdefault((cell.task, cell.method), []).append(mark)
+    for (task, method), seeds in marks.items():
+        print(f"{task:20}{method:28}{' '.join(seeds)}")
+    count = sum(seeds.count("x") for seeds in marks.values())
+    print(f"{count} of {sum(map(len, marks.values()))} runs")
 
 
 def run(cell, seconds):
-    """Train for at most so long, then evaluate and keep the small files. Returns whether it came to its end."""
+    """Train for at most `seconds`, then evaluate and keep the small files. Returns True if the run is complete."""
     log = ROOT / "runs" / cell.folder / "log.txt"
     log.parent.mkdir(parents=True, exist_ok=True)
     with log.open("a") as file:
         if not recording.finetune(cell.words(), file, seconds):
             return False
-        recording.evaluate(cell.task, cell.folder, ROOT / "results" / cell.folder, KEPT, file)
+        recording.evaluate(cell.folder, ROOT / "results" / cell.folder, KEPT, file)
     return True
 
 
 def main(args):
-    for name in {*args.tasks} - GRID.keys() | {*(args.methods or ())} - METHODS.keys():
-        raise records.UserError(f"unknown task or method {name!r}; known: {', '.join([*GRID, *METHODS])}")
-    every = list(cells(args))
+    for name in {*args.tasks} - TASKS.keys() | {*(args.methods or ())} - METHODS.keys():
+        raise records.UserError(f"unknown task or method {name!r}; known: {', '.join([*TASKS, *METHODS])}")
+    runs = list(cells(args))
     if args.status:
-        return show_status(every)
-    missing = [cell for cell in every if cell.done() != 1.0]
+        return show_status(runs)
+    missing = [cell for cell in runs if cell.done() != 1.0]
     start = time.perf_counter()
     for cell in missing:
         left = 60 * args.budget_minutes - (time.perf_counter() - start)
@@ -171,6 +137,6 @@ def main(args):
 
 
 if __name__ == "__main__":
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that the run under way is asked to stop as well
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # it stops the run under way, too
     with records.one_line_errors():
         main(tyro.cli(Args, description=__doc__))

@@ -3,8 +3,8 @@
     python results/tasks.py --tasks anymal_climb_up anymal_jump
     python results/tasks.py --tasks anymal_climb_up --stages look
 
-Where a task has levels, levels.png shows how many environments were at each at the end of training, and how often the
-trained policy's mean action succeeds there.
+If a task has levels, levels.png shows the share of environments at each level at the end of training, and the share of
+episodes there in which the trained policy's mean action succeeds.
 """
 
 import csv
@@ -21,7 +21,7 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 
 import envs
-from envs import records
+from experiment import figures, records
 from results import recording
 
 KEPT = ("args.json", "metrics.csv", "curve.png", "eval.json", "policy.msgpack", "rollout.png", "rollout.gif")
@@ -35,38 +35,36 @@ class Args:
 
 
 def draw_levels(folder):
-    """levels.png of a kept run: share of environments and success of the mean action over levels."""
+    """Draw levels.png of a kept run."""
     with (folder / "metrics.csv").open() as file:
         last = list(csv.DictReader(file))[-1]
     result = json.loads((folder / "eval.json").read_text())
     names = [name for name in last if name.startswith("level/")]
     level = np.arange(len(names))
-    plt = records.pyplot()
-    fig, ax = plt.subplots(figsize=(4.5, 2.8), constrained_layout=True)
+    fig, ax = figures.pyplot().subplots(figsize=(4.5, 2.8), constrained_layout=True)
     ax.bar(level - 0.2, [float(last[name]) for name in names], 0.4, label="environments at the end of training")
     success = [result[f"level {i}"]["episode_success"] for i in level]
     ax.bar(level + 0.2, success, 0.4, label="success of the mean action")
     ax.set(xlabel=f"level of {folder.name}", xticks=level, ylim=(0, 1))
     fig.legend(fontsize=7, loc="outside upper center", ncols=2)
     ax.grid(alpha=0.3)
-    fig.savefig(folder / "levels.png", dpi=110, metadata={"Software": None})
-    plt.close(fig)
+    figures.save(fig, folder / "levels.png")
 
 
 def main(args):
     for name in {*args.tasks} - envs.TASKS.keys():
-        print(f"error: unknown task {name!r}; known: {', '.join(envs.TASKS)}", file=sys.stderr)
-        sys.exit(2)
+        raise records.UserError(f"unknown task {name!r}; known: {', '.join(envs.TASKS)}")
     for task in args.tasks:
-        run, kept = f"tasks/{task}", ROOT / "results/tasks" / task
+        run, folder = f"tasks/{task}", ROOT / "results/tasks" / task
         if "train" in args.stages:
             recording.finetune(["--task", task, "--preset", args.preset, "--run-dir", f"runs/{run}", "--force"])
         if "look" in args.stages:
-            recording.evaluate(task, run, kept, KEPT)
-            if "level 0" in json.loads((kept / "eval.json").read_text()):
-                draw_levels(kept)
-                print(f"wrote {kept / 'levels.png'}")
+            recording.evaluate(run, folder, KEPT)
+            if envs.TASKS[task][0].LEVELS:
+                draw_levels(folder)
+                print(f"wrote {folder / 'levels.png'}")
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args, description=__doc__))
+    with records.one_line_errors():
+        main(tyro.cli(Args, description=__doc__))

@@ -1,18 +1,20 @@
-"""The benchmark measures what it says, says why where it could not, and refuses what it does not know."""
+"""The benchmark measures, reports reasons for failures, and refuses bad arguments."""
 
 import json
+from types import SimpleNamespace
 
 import pytest
 
-from results import bench
+from experiment import records
+from tools import bench
 
 
-def test_a_figure_of_a_process_of_its_own():
+def test_a_figure_from_a_process_of_its_own():
     row = bench.in_process(120, "stepping", "go1_loco", "c", 4, False)
     assert row["steps/s"] > 0 and row["compile s"] > 0 and 50 < row["MiB"] < 4000
 
 
-def test_what_could_not_be_measured_is_said():
+def test_a_failure_gives_its_reason():
     assert "unknown task" in bench.in_process(120, "stepping", "go2_loco", "c", 4, False)["failed"]
     assert bench.in_process(0.01, "stepping", "go1_loco", "c", 4, False)["failed"].startswith("did not end in")
 
@@ -32,7 +34,7 @@ def test_ratios():
     assert ratios == [(1.0, 1.0), (2.0, 2.0), (1.0, 100 / 60), (3.0, 5.0), (None, None)]
 
 
-def test_training_takes_what_the_device_is_for(monkeypatch):
+def test_training_is_measured_at_the_scale_of_the_device(monkeypatch):
     """A CPU trains 512 environments on engine c; an accelerator each number of them on each engine."""
     monkeypatch.setattr(bench, "in_process", lambda *inputs: {"asked": inputs[2:]})
     args = bench.Args(tasks=("go1_loco",), engines=("mjx", "warp"), counts=(1024, 4096))
@@ -45,7 +47,21 @@ def test_training_takes_what_the_device_is_for(monkeypatch):
 
 @pytest.mark.parametrize(
     ("changes", "words"),
-    [({"tasks": ("go2_loco",)}, ["unknown task 'go2_loco'"]), ({"parts": ("peers",)}, ["--peers PYTHON", "peers.py"])],
+    [({"tasks": ("go2_loco",)}, "unknown task 'go2_loco'"), ({"parts": ("peers",)}, "--peers PYTHON.*tools/peers.py")],
 )
-def test_bad_arguments(changes, words, refused):
-    refused(bench.main, bench.Args(**changes), *words)
+def test_bad_arguments(changes, words):
+    with pytest.raises(records.UserError, match=words):
+        bench.main(bench.Args(**changes))
+
+
+def test_the_peers_command_names_a_script(monkeypatch):
+    """It is started in the repository's root by another Python, so a wrong path would show only there."""
+    commands = []
+
+    def run(command, cwd, **_):
+        commands.append((cwd / command[1]).exists())
+        return SimpleNamespace(returncode=1, stderr="torch is missing\n")
+
+    monkeypatch.setattr(bench.subprocess, "run", run)
+    assert bench.run_peer(bench.Args(peers="python"), ["rsl_rl"]) == {"failed": "torch is missing"}
+    assert commands == [True]

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import ppo_finetune as script
-from envs import records
+from experiment import records
 
 ROOT = Path(__file__).resolve().parent.parent
 SMOKE = ("--preset", "smoke", "--engine", "mjx", "--num-envs", "8", "--log-every", "2", "--shuffle-blocks", "2")
@@ -77,7 +77,7 @@ def test_strangers_are_refused():
     """--distributed where nothing says who this process is; in a process of its own, for JAX must not have started."""
     process = start(["ppo_finetune.py", "--distributed"])
     _, err = process.communicate(timeout=120)
-    assert process.returncode == 2 and err.startswith("error: --distributed: ") and "envs/devices.py" in err, err
+    assert process.returncode == 2 and err.startswith("error: --distributed: ") and "experiment/devices.py" in err, err
 
 
 @pytest.fixture(scope="module")

@@ -1,6 +1,7 @@
-"""The environment contract: history, resets, time limits, noise, randomisation, mirrors, broken simulations."""
+"""The environment contract: hooks, history, resets, noise, randomisation, mirrors, broken simulations, options."""
 
 import dataclasses
+import re
 import sys
 
 import jax
@@ -8,9 +9,12 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from PIL import Image
 
 import envs
-from envs.base import PROP
+from envs import render
+from envs.base import PROP, Env
+from envs.config import fits, parse
 from envs.engine import ENGINES, make_engine
 from envs.robots import ROBOTS
 
@@ -45,6 +49,58 @@ def test_contract(task):
     assert start.history["prop"].shape == (env.config.history + 1, env.prop_dim)
     assert start.history["action"].shape == (env.config.history, env.action_dim)
     assert set(env.config.weights) == {name[7:] for name in start.metrics if name.startswith("reward/")}
+
+
+def documented_hooks():
+    """Order of the hooks in `reset` and in `step`, as the docstring of Env has it."""
+    reset, step = re.search(r"reset: (.*) step: (.*)", " ".join(Env.__doc__.split())).groups()
+    reset = [word.strip() for word in reset.split(",")]
+    step = step.replace("as in reset without first_curriculum", ",".join(reset[1:]))
+    return reset, [word.strip().removeprefix("then ") for word in step.split(",")]
+
+
+def recorded(family, names, calls):
+    """A subclass of a task family that appends the names of its hooks to `calls` as they are called."""
+
+    def recording(name):
+        def hook(self, *args):
+            calls.append(name)
+            return getattr(family, name)(self, *args)
+
+        return hook
+
+    return type("Recorded", (family,), {name: recording(name) for name in names})
+
+
+@pytest.mark.parametrize("task", ["g1_loco", "anymal_pedipulation", "anymal_crouch", "exploration"])
+def test_hooks_are_called_in_the_documented_order(task):
+    family, config = envs.TASKS[task] if task in envs.TASKS else (envs.Explore, envs.EXPLORE["go1"])
+    in_reset, in_step = documented_hooks()
+    calls = []
+    env = recorded(family, {*in_reset, *in_step}, calls)(config, "c")
+    state = jax.eval_shape(env.reset, jax.random.key(0))
+    assert calls == in_reset
+    calls.clear()
+    jax.eval_shape(env.step, state, jnp.zeros(env.action_dim))
+    assert calls == in_step and {"before_rewards", "next_curriculum", "after_rewards"} < set(in_step)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_slices_tile_the_vectors(task):
+    """Blocks follow each other without gaps, each as wide as its kind says."""
+    env = envs.make(task, "c")
+    obs_kinds = {name: kind for name, (kind, _) in env.OBS.items()}
+    for slices, kinds, size in ((env.obs_slices(), obs_kinds, env.obs_dim), (env.prop_slices(), PROP, env.prop_dim)):
+        assert list(slices) == list(kinds)
+        assert [i for s in slices.values() for i in range(s.start, s.stop)] == list(range(size))
+        assert [s.stop - s.start for s in slices.values()] == [env.width(kind) for kind in kinds.values()]
+    assert tuple(env.prop_slices()) == env.prop_layout
+
+
+def test_slices_by_hand():
+    env = envs.make("go1_loco", "c")
+    assert env.obs_slices()["command"] == slice(9, 12) and env.obs_slices()["action"] == slice(36, 48)
+    assert env.prop_slices()["joint_pos"] == slice(6, 18) and env.prop_slices()["joint_vel"] == slice(18, 30)
 
 
 def test_observation_widths():
@@ -146,7 +202,7 @@ def overturned(state):
 
 
 def test_failure_resets_everything(jitted):
-    """A fallen robot terminates; what follows is a fresh episode, what was is in final_obs."""
+    """A fallen robot terminates; a new episode follows, and final_obs shows the old one."""
     task = jitted("go1_loco")
     state = task.start(2)
     for i in range(3):
@@ -326,15 +382,138 @@ def test_mirrors_are_involutions(jitted, task):
             np.testing.assert_array_equal(env.mirror(mirror, name, once), x)
 
 
+# --- options ---
+
+OPTIONS = [  # task, name, text after --set NAME=, value
+    ("go1_loco", "push_velocity", "1", 1.0),
+    ("go1_loco", "noise", ".5", 0.5),
+    ("go1_loco", "max_tilt", "1e2", 100.0),
+    ("go1_loco", "history", "7", 7),
+    ("go1_loco", "push_axes", "6", 6),
+    ("go1_loco", "friction", "0.3,1.2", (0.3, 1.2)),
+    ("go1_loco", "lin_vel_x", "-1, 2", (-1.0, 2.0)),
+    ("go1_loco", "added_mass", "(-1,3)", (-1.0, 3.0)),
+    ("go1_loco", "fixed_velocity", "none", None),
+    ("go1_loco", "fixed_velocity", "1,0", (1.0, 0.0)),
+    ("g1_loco", "contact_ends", "torso,pelvis", ("torso", "pelvis")),
+    ("g1_loco", "effort_joints", "knee", ("knee",)),
+    ("anymal_jump", "level", "4", 4),
+    ("anymal_jump", "level", "None", None),
+    ("anymal_jump", "skill", "walk", "walk"),
+    ("anymal_pedipulation", "curriculum", "true", True),
+    ("anymal_pedipulation", "curriculum", "False", False),
+    ("anymal_pedipulation", "fixed_point", "0.7,0,1", (0.7, 0.0, 1.0)),
+    ("anymal_pedipulation", "box", "(0,1),(0,.5),(-1,1)", ((0.0, 1.0), (0.0, 0.5), (-1.0, 1.0))),
+    ("go1_loco", "weights.torque", "-1e-4", -1e-4),
+]
+
+
+@pytest.mark.parametrize(("task", "name", "text", "value"), OPTIONS)
+def test_options_are_read_from_text(task, name, text, value):
+    """Text becomes a value of the field's type; the value itself is taken as well."""
+    for given in (text, value):
+        config = envs.replace_checked(envs.TASKS[task][1], {name: given})
+        got = config.weights[name[8:]] if name.startswith("weights.") else getattr(config, name)
+        assert got == value and repr(got) == repr(value)  # 1 == 1.0 == True
+
+
+def test_options_leave_the_rest_as_it_is():
+    """One weight changes in its place: the order of the reward's sum stays. The task's own config stays, too."""
+    config = envs.TASKS["go1_loco"][1]
+    changed = envs.replace_checked(config, {"weights.alive": "2", "noise": "0"})
+    assert list(changed.weights) == list(config.weights)
+    assert changed.weights == config.weights | {"alive": 2.0} and config.weights["alive"] == 0.25
+    assert dataclasses.replace(changed, weights=config.weights, noise=config.noise) == config
+    assert envs.replace_checked(config, {"friction": [1, 2]}).friction == (1.0, 2.0)
+    assert envs.make_explore("go1", "c", perturb_force="0").config.perturb_force == 0.0
+
+
+REFUSALS = [
+    ("go1_loco", "gravity", "1", "unknown option 'gravity'; choose one of added_mass, air_time_threshold, command_sec"),
+    ("go1_loco", "weights.fun", "1", "unknown option 'weights.fun'; choose one of weights.action_rate, weights.air_"),
+    ("go1_loco", "engine", "c", "unknown option 'engine'; choose one of"),
+    ("go1_loco", "task", "c", "unknown option 'task'; choose one of"),
+    ("go1_loco", "ppo", "{}", "ppo cannot be set: PPO's settings are flags of their own, like --lr"),
+    ("go1_loco", "robot", "g1", "robot cannot be set: it belongs to the task"),
+    ("go1_loco", "weights", "1", "weights takes one number at a time, as weights.NAME=0.5, not '1'"),
+    ("go1_loco", "weights.alive", "much", "weights.alive takes a number like 0.5, not 'much'"),
+    ("go1_loco", "friction", "abc", "friction takes two numbers like 0.3,1.2, not 'abc'"),
+    ("go1_loco", "friction", "1", "friction takes two numbers like 0.3,1.2, not '1'"),
+    ("go1_loco", "friction", "1,2,3", "friction takes two numbers like 0.3,1.2, not '1,2,3'"),
+    ("go1_loco", "friction", "0.3,inf", "friction takes two numbers like 0.3,1.2, not '0.3,inf'"),
+    ("go1_loco", "friction", (1.0,), "friction takes two numbers like 0.3,1.2, not (1.0,)"),
+    ("go1_loco", "noise", "", "noise takes a number like 0.5, not ''"),
+    ("go1_loco", "noise", "nan", "noise takes a number like 0.5, not 'nan'"),
+    ("go1_loco", "noise", "1e999", "noise takes a number like 0.5, not '1e999'"),
+    ("go1_loco", "noise", float("nan"), "noise takes a number like 0.5, not nan"),
+    ("go1_loco", "noise", "true", "noise takes a number like 0.5, not 'true'"),
+    ("go1_loco", "noise", "1if", "noise takes a number like 0.5, not '1if'"),
+    ("go1_loco", "noise", "open('x')", "noise takes a number like 0.5, not"),
+    ("go1_loco", "noise", "[" * 9999, "noise takes a number like 0.5, not"),
+    ("go1_loco", "history", "2.5", "history takes a whole number like 4, not '2.5'"),
+    ("go1_loco", "history", "0", "history must be above 0, not 0"),
+    ("go1_loco", "history", "9" * 5000, "history takes a whole number like 4, not"),
+    ("go1_loco", "push_axes", "3", "push_axes takes 2 or 6, not '3'"),
+    ("go1_loco", "fixed_velocity", "1", "fixed_velocity takes two numbers like 0.3,1.2 or none, not '1'"),
+    ("anymal_jump", "level", "high", "level takes a whole number like 4 or none, not 'high'"),
+    ("anymal_jump", "level", "10", "level 10 does not exist; choose 0 to 9"),
+    ("anymal_jump", "skill", "fly", "unknown skill 'fly'; choose one of walk"),
+    ("anymal_pedipulation", "curriculum", "1", "curriculum takes true or false, not '1'"),
+    (
+        "anymal_pedipulation",
+        "fixed_point",
+        "1,2",
+        "fixed_point takes three numbers like 0.7,-0.2,0.5 or none, not '1,2'",
+    ),
+    ("anymal_pedipulation", "box", "0,1", "box takes three pairs like (0,1),(-0.4,0.2),(-0.1,1.3), not '0,1'"),
+    ("anymal_pedipulation", "foot", "LF", "unknown foot 'LF'; choose one of LF_foot, RF_foot"),
+    ("g1_loco", "contact_ends", "torso,tail", "the robot's MJCF has no sensor 'tail_force'"),
+    ("g1_loco", "effort_joints", "wing", "no joint of g1 has 'wing' in its name"),
+]
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize(("task", "name", "value", "message"), REFUSALS)
+def test_options_are_refused_in_one_line(task, name, value, message):
+    with pytest.raises(ValueError, match=re.escape(message)) as refusal:
+        envs.make(task, "c", **{name: value})
+    assert "\n" not in str(refusal.value)
+
+
+@pytest.mark.parametrize(
+    ("value", "kind", "good"),
+    [
+        (3, int, True),
+        (3.0, int, False),
+        (True, int, False),
+        (2**31, int, False),
+        (3, float, True),
+        (float("inf"), float, False),
+        (None, str | None, True),
+        ("a", str | None, True),
+        (1, str | None, False),
+        ([1, 2, 3], tuple[int, ...], True),
+        ([1, "2"], tuple[int, ...], False),
+        ([1] * 100, tuple[int, ...], False),
+        ([1.0, 2.0], tuple[float, float], True),
+        ([1.0], tuple[float, float], False),
+    ],
+)
+def test_values_of_json_fit_their_annotation(value, kind, good):
+    assert fits(value, kind) == good
+    if good and kind in (int, float):
+        assert parse(repr(value), kind) == value
+
+
 def test_wrong_names_are_listed():
     with pytest.raises(
         ValueError, match="unknown task 'go2_loco'; choose one of anymal_loco, go1_loco, g1_loco, anymal_ped"
     ):
         envs.make("go2_loco")
+    with pytest.raises(ValueError, match="unknown robot 'spot'; choose one of anymal_d, go1, g1"):
+        envs.make_explore("spot")
     with pytest.raises(ValueError, match="unknown engine 'bullet'; choose one of auto, c, mjx"):
         envs.make("go1_loco", "bullet")
-    with pytest.raises(ValueError, match="unknown option 'gravity'; choose one of"):
-        envs.make("go1_loco", gravity=0)
 
 
 @pytest.mark.parametrize(("engine", "module"), [("mjx", "mujoco.mjx"), ("c", "mujoco.batch")])
@@ -354,3 +533,26 @@ def test_configs_are_frozen_and_prop_is_sensed():
     with pytest.raises(dataclasses.FrozenInstanceError):
         envs.TASKS["go1_loco"][1].noise = 0
     assert sum(3 if kind != "joint" else 12 for kind in PROP.values()) == envs.make("go1_loco", "c").prop_dim == 30
+
+
+# --- pictures ---
+
+
+def test_frames_of_a_strip_show_a_stride_in_different_phases(monkeypatch, tmp_path):
+    """Frames carry the number of their step as their colour. No two in a row are near the same phase of a stride."""
+
+    def draw(_, qpos):
+        return [Image.new("RGB", (render.WIDTH, render.HEIGHT), (int(step), 0, 200)) for step in qpos[:, 0] % 256]
+
+    monkeypatch.setattr(render, "build", lambda *_: None)
+    monkeypatch.setattr(render, "draw", draw)
+    env = envs.make("go1_loco", "c")
+    steps = np.arange(500.0)[:, None]
+    render.film(env, steps, None, tmp_path, **env.FILM_WINDOW)
+    sheet = Image.open(tmp_path / "rollout.png")
+    middles = [(render.WIDTH * (i % 5) + 160, render.HEIGHT * (i // 5) + 120) for i in range(10)]
+    apart = np.diff([sheet.getpixel(at)[0] for at in middles]) * env.dt  # [s]
+    for stride in np.arange(0.30, 0.46, 0.01):
+        phase = apart / stride % 1
+        assert (np.minimum(phase, 1 - phase) > 0.1).all(), stride
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["rollout.gif", "rollout.png"]

@@ -18,10 +18,11 @@ import optax
 import pytest
 
 import envs
+import play
 import ppo_explore as script
 import ppo_finetune
 import pretrain_pidm
-from envs import records
+from experiment import records
 
 ROOT = Path(__file__).resolve().parent.parent
 SMOKE = script.Args(preset="smoke", total_steps=400)
@@ -45,20 +46,6 @@ def test_rough_ground_is_what_a_ray_meets(go1):
         distance = mujoco.mj_ray(go1.model, data, start, np.array([0.0, 0, -1]), None, 1, -1, np.zeros(1, np.int32))
         assert abs(5.0 - distance - height) < 0.002
     assert want.max() > 0.05 and want.min() == 0.0
-
-
-def test_calm_episodes_do_less_and_say_so():
-    """Actions shrink by each episode's own factor; history and observation hold what was done, not what was said."""
-    env = envs.make_explore("go1", "c", calm=0.2)
-    state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), 400))
-    factor = np.asarray(state.task.vigour)
-    assert factor.min() < 0.23 and factor.max() > 0.97 and abs(factor.mean() - 0.6) < 0.05
-    said = jax.random.normal(jax.random.key(1), (400, 12))
-    after = jax.jit(jax.vmap(env.step))(state, said)
-    done = np.asarray(after.terminated | after.truncated)
-    np.testing.assert_allclose(after.history["action"][~done, -1], (factor[:, None] * said)[~done], rtol=1e-6)
-    plain = envs.make_explore("go1", "c")
-    assert float(plain.executed(plain.reset(jax.random.key(0)), jnp.ones(12))[0]) == 1.0
 
 
 @pytest.mark.parametrize("robot", envs.EXPLORE)
@@ -161,12 +148,12 @@ def test_reward_scale_leaves_the_untrained_ensemble_behind(fitted):
     """Twenty rollouts after its start at a tenfold disagreement the scale is within 15% of the present one."""
     member, _, ensemble, _, buffer = fitted
     seen = jax.tree.map(lambda x: x[:64].reshape(8, 8, *x.shape[1:]), buffer)
-    raw, ensemble, metrics = script.judge(member, ensemble, seen)
+    raw, ensemble, metrics = script.measure_novelty(member, ensemble, seen)
     assert raw.shape == (8, 8)
     np.testing.assert_allclose(ensemble.scale, metrics["disagreement"])  # the first rollout sets it
     ensemble = ensemble.replace(scale=10 * ensemble.scale)
     for _ in range(20):
-        _, ensemble, _ = script.judge(member, ensemble, seen)
+        _, ensemble, _ = script.measure_novelty(member, ensemble, seen)
     assert 1.0 < ensemble.scale / raw.mean() < 1.15
 
 
@@ -177,7 +164,7 @@ def test_disagreement_is_the_variance_over_members():
 
 
 def test_bootstrap_draws_differ_per_member_and_stay_within_the_data():
-    draws = np.asarray(script.bootstrap(jax.random.key(0), (8, 5, 512), 1000))
+    draws = np.asarray(script.bootstrap_indices(jax.random.key(0), (8, 5, 512), 1000))
     assert draws.max() < 1000 and len(np.unique(draws[0, 0])) < 512  # with replacement
     for member in range(1, 5):
         assert (draws[:, member] == draws[:, 0]).mean() < 0.01
@@ -226,6 +213,18 @@ def test_collection_on_disk(collected):
     np.testing.assert_allclose(got["next_x"] - got["prop"][:, -1], flat["delta"][slot[usable]], atol=1e-6)
 
 
+def test_set_reaches_the_data_and_the_records(tmp_path):
+    """All on the plane, with the numbers in args.json and meta.json; what is not named keeps its value."""
+    out = tmp_path / "flat"
+    script.main(dataclasses.replace(SMOKE, run_dir=str(out), set=("rough=0", "friction=0.5,0.6")))
+    assert not np.load(out / "rough.npy").any()
+    for name in ("args.json", "meta.json"):
+        record = json.loads((out / name).read_text())
+        assert record.get("args", record)["set"] == ["rough=0", "friction=0.5,0.6"]
+        config = dataclasses.asdict(envs.EXPLORE["go1"]) | {"rough": 0.0, "friction": (0.5, 0.6)}
+        assert record["config"] == json.loads(json.dumps(config))
+
+
 def test_random_policy_does_not_learn(tmp_path):
     state = script.main(dataclasses.replace(SMOKE, policy="random", run_dir=str(tmp_path / "r")))
     assert float(jnp.exp(state.params["params"]["log_std"]).mean()) == pytest.approx(1.0)
@@ -241,7 +240,7 @@ def test_stages_one_to_three_through_files(collected, tmp_path):
     assert meta["args"]["network"] == "pidm"
     header = (run / "metrics.csv").read_text().splitlines()[0].split(",")
     assert {"update/actor/backbone", "update/actor/intention_encoder", "update/critic/value_synthesizer"} <= set(header)
-    ppo_finetune.main(ppo_finetune.Args(eval=str(run / "policy.msgpack"), eval_envs=2))
+    play.main(play.Args(policy=str(run / "policy.msgpack"), episodes=2))
     assert (run / "eval.json").exists()
 
 
@@ -254,8 +253,10 @@ def test_stages_one_to_three_through_files(collected, tmp_path):
         ({"robot": "spot"}, ["unknown robot 'spot'", "go1"]),
         ({"num_envs": 1}, ["--validation 0.08 of 1 environments"]),
         ({"validation": 0.0}, ["--validation 0.0"]),
-        ({"calm": 0.0}, ["--calm must be above 0"]),
         ({"members": 0}, ["--members must be at least 1"]),
+        ({"set": ("rough=2m",)}, ["rough takes a number like 0.5, not '2m'"]),
+        ({"set": ("calm=0.5",)}, ["unknown option 'calm'", "rough"]),
+        ({"set": ("rough",)}, ["NAME=VALUE", "'rough'"]),
         ({"num_minibatches": 5}, ["5 minibatches do not divide"]),
     ],
 )

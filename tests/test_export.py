@@ -9,23 +9,19 @@ import numpy as np
 import pytest
 
 import envs
-import ppo_finetune as script
+import play
+import ppo_finetune
 from envs.base import PROP
-from results import play_onnx
+from tools import play_onnx
 
 ROOT = Path(__file__).resolve().parent.parent
 WALKER = ROOT / "results/tasks/go1_loco/policy.msgpack"
 
 
 def readings(env, state):
-    """The blocks that a robot would measure, by name, taken from the noiseless observation of one environment."""
-    blocks, start = {}, 0
-    for name, (kind, scale) in env.OBS.items():
-        stop = start + env.width(kind)
-        blocks[name] = np.asarray(state.obs[start:stop]) / np.array(scale)
-        start = stop
-    blocks["joint_pos"] = blocks["joint_pos"] + np.asarray(env.default_pose)
-    return blocks
+    """Readings of a robot by name, from the noiseless observation of one environment."""
+    blocks = {name: state.obs[where] / np.array(env.OBS[name][1]) for name, where in env.obs_slices().items()}
+    return blocks | {"joint_pos": blocks["joint_pos"] + env.default_pose}
 
 
 @pytest.mark.parametrize(("task", "network"), [("go1_loco", "mlp"), ("g1_loco", "pidm"), ("anymal_climb_up", "pidm")])
@@ -34,19 +30,21 @@ def test_onboard_policy_is_the_trained_one(task, network):
     quiet = {"noise": 0.0, "push_velocity": 0.0}
     quiet |= {"scan_noise": 0.0, "scan_shift": 0.0} if task == "anymal_climb_up" else {}
     env = envs.make(task, "c", **quiet)
-    args = script.merge(script.Args(task=task, network=network, preset="smoke"), env.config.ppo)
-    net = script.make_net(args, env)
-    params = script.init_params(args, env, net, jax.random.key(0))
-    noise = jax.random.key(1)  # a fresh network answers 0 to everything
-    params = jax.tree.map(lambda x: x + 0.03 * jax.random.normal(noise, x.shape), params)
-    policy, shapes = script.onboard(env, net, params)
-    policy, step = jax.jit(policy), jax.jit(env.step)
+    args = ppo_finetune.merge(ppo_finetune.Args(task=task, network=network, preset="smoke"), env.config.ppo)
+    net = ppo_finetune.make_net(args, env)
     state = jax.jit(env.reset)(jax.random.key(0))
+    params = net.init(jax.random.key(0), net.inputs(state.obs, state.history))
+    if network == "pidm":
+        params = ppo_finetune.warm_start(args, env, params, jax.random.key(1))  # its input normalisation
+    noise = jax.random.key(1)  # initial networks answer about 0 to everything
+    params = jax.tree.map(lambda x: x + 0.03 * jax.random.normal(noise, x.shape), params)
+    policy, shapes = play.onboard(env, net, params)
+    policy, step = jax.jit(policy), jax.jit(env.step)
     history = {"prop_history": state.history["prop"][1:], "action_history": jnp.zeros((5, env.action_dim))}
     for _ in range(8):
         given = readings(env, state) | history
         action, target, *after = policy(*(jnp.asarray(given[name], jnp.float32) for name in shapes))
-        inputs = script.net_inputs(net, state.obs, state.history)
+        inputs = net.inputs(state.obs, state.history)
         np.testing.assert_allclose(action, net.apply(params, inputs, method=net.mean), atol=1e-4)
         np.testing.assert_allclose(target, env.default_pose + env.robot.action_scale * action, atol=1e-6)
         history = dict(zip(history, after, strict=True))
@@ -60,14 +58,14 @@ def exported(tmp_path_factory):
     pytest.importorskip("jax2onnx")
     pytest.importorskip("onnxruntime")
     path = tmp_path_factory.mktemp("onnx") / "policy.onnx"
-    script.main(script.Args(task="go1_loco", engine="c", eval=str(WALKER), export=str(path)))
+    play.main(play.Args(str(WALKER), engine="c", export=str(path)))
     return path
 
 
 def test_onnx_walks_in_plain_mujoco_as_jax_would(exported):
-    """JAX follows the rollout of the ONNX policy: the same actions to 1e-5. The robot goes where it is told."""
-    env = envs.make("go1_loco", "c")
-    policy, shapes = script.onboard(env, *script.load_policy(script.Args(task="go1_loco", eval=str(WALKER)), env))
+    """In JAX and ONNX actions are equal to 1e-5 along a rollout. The robot follows its command."""
+    env, net, params, _ = play.load_policy(WALKER, "c")
+    policy, shapes = play.onboard(env, net, params)
     policy, player, command = jax.jit(policy), play_onnx.Player(exported), (0.8, 0.0, 0.0)
     player.step(command)
     for _ in range(100):
@@ -78,7 +76,7 @@ def test_onnx_walks_in_plain_mujoco_as_jax_would(exported):
     assert falls == 0 and np.abs(velocity - command).max() < 0.15, velocity
 
 
-def test_the_file_says_what_it_is(exported):
+def test_metadata_of_the_file(exported):
     facts = play_onnx.Player(exported).facts
     assert facts["task"] == "go1_loco" and len(facts["joints"]) == len(facts["default_pose"]) == 12
     assert facts["prop"] == list(PROP) and facts["dt"] == 0.02 and "commit" in facts["versions"]
@@ -95,9 +93,11 @@ def test_bad_files_are_one_line(tmp_path, capsys):
 
 def test_export_without_its_package_is_one_line(refused, monkeypatch):
     monkeypatch.setitem(sys.modules, "jax2onnx", None)
-    args = script.Args(task="go1_loco", eval=str(WALKER), export="x.onnx")
-    refused(script.main, args, "requirements-export.txt")
+    refused(play.main, play.Args(str(WALKER), export="x.onnx"), "requirements-export.txt")
 
 
-def test_export_needs_a_policy(refused):
-    refused(script.main, script.Args(export="x.onnx"), "--eval")
+def test_only_a_policy_is_exported(refused, tmp_path):
+    pytest.importorskip("jax2onnx")
+    pidm = str(ROOT / "assets/pidm/go1.msgpack")
+    refused(play.main, play.Args(pidm, export=str(tmp_path / "x.onnx")), "is not a policy")
+    assert not (tmp_path / "x.onnx").exists()

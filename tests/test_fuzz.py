@@ -18,7 +18,7 @@ import pytest
 
 import ppo_finetune
 import pretrain_pidm
-from envs import records
+from experiment import records
 from results import report
 
 MUTATIONS = 1_000  # of each format

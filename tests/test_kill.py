@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 import ppo_explore
-from envs import records
+from experiment import records
 
 ROOT = Path(__file__).resolve().parent.parent
 KILLS = int(os.environ.get("KILLS", "2"))

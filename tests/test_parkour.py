@@ -1,7 +1,5 @@
 """Pedipulation and the parkour skills: courses against mj_ray, spawns, levels, scans, mirrors, rewards, endings."""
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -9,8 +7,7 @@ import numpy as np
 import pytest
 
 import envs
-import ppo_finetune as script
-from envs import courses, parkour, records
+from envs import courses, parkour
 
 SKILLS = {
     "anymal_parkour_walk": "walk",
@@ -198,15 +195,18 @@ def climb_up(jitted):
     return env, jax.jit(env.reset)(jax.random.key(0))
 
 
-def rule(env, state, level, distance, far, terminated, best=0, rough=False):
+def rule(env, state, level, distance, start_distance, terminated, best=0, rough=False):
     """The next level and best of an environment at a level whose episode ends at a distance."""
     task = state.task.replace(
-        level=jnp.int32(level), best=jnp.int32(best), far=jnp.float32(far), rough=jnp.array(rough)
+        level=jnp.int32(level),
+        best=jnp.int32(best),
+        start_distance=jnp.float32(start_distance),
+        rough=jnp.array(rough),
     )
     motion = env.motion(state.physics)
     goal = motion.base_pos + jnp.array([distance, 0.0, 0.0])
     ended = jnp.asarray(terminated)
-    after = env.graduate(jax.random.key(1), task.replace(goal=goal), motion, ended, ~ended)
+    after = env.next_curriculum(jax.random.key(1), task.replace(goal=goal), motion, ended, ~ended)
     return int(after["level"]), int(after["best"])
 
 
@@ -269,7 +269,7 @@ def test_foot_force_and_base_contact_end_an_episode(jitted):
         return bool(env.failed(state.task, motion.replace(**forces)))
 
     foot = jnp.zeros((4, 3)).at[2, 2]
-    sensors = motion.sensors.at[env.ends[0]]
+    sensors = motion.sensors.at[env.end_sensors[0]]
     assert not ends(foot_force=foot.set(1990.0)) and ends(foot_force=foot.set(2010.0))
     assert not ends(sensors=sensors.set(0.5)) and ends(sensors=sensors.set(2.0))
 
@@ -328,22 +328,10 @@ def test_levels_that_do_not_exist_are_refused(level):
         envs.make("anymal_jump", "c", level=level)
 
 
-def test_unknown_skill_is_refused():
-    with pytest.raises(ValueError, match="unknown skill 'fly'; choose one of walk"):
-        envs.make("anymal_jump", "c", skill="fly")
-
-
-def test_level_of_an_evaluation(jitted, tmp_path, refused):
-    """A policy is evaluated at a level that exists, of its own skill."""
-    env = jitted("anymal_jump").env
-    args = script.merge(script.Args(task="anymal_jump", preset="smoke", level=10), env.config.ppo)
-    net = script.make_net(args, env)
-    policy = tmp_path / "policy.msgpack"
-    params = net.init(jax.random.key(0), script.zero_inputs(env, net))
-    records.save(policy, params, {"task": args.task, "args": dataclasses.asdict(args)})
-    refused(script.main, dataclasses.replace(args, eval=str(policy)), "level 10 does not exist; choose 0 to 9")
-    other = dataclasses.replace(args, eval=str(policy), task="anymal_crouch", level=0)
-    refused(script.main, other, "is a policy for anymal_jump, not for anymal_crouch")
+def test_only_parkour_has_levels():
+    levels = {task: family.LEVELS for task, (family, _) in envs.TASKS.items()}
+    assert levels == {task: 10 * (task in SKILLS) for task in envs.TASKS}
+    assert all(hasattr(family, "at_level") == (family.LEVELS > 0) for family, _ in envs.TASKS.values())
 
 
 # --- pedipulation ---
@@ -392,7 +380,11 @@ def test_pedipulation_rewards_by_hand(jitted):
         torque=zero.at[0].set(3.0),
         joint_acc=zero.at[1].set(5.0),
         joint_vel=zero.at[2].set(2.0),
-        sensors=jnp.zeros_like(motion.sensors).at[env.bodies[0, 2]].set(4.0).at[env.bodies[-1, 0]].set(2.0),
+        sensors=jnp.zeros_like(motion.sensors)
+        .at[env.collision_sensors[0, 2]]
+        .set(4.0)
+        .at[env.collision_sensors[-1, 0]]
+        .set(2.0),
     )
     got = env.rewards(state.task.replace(point=jnp.zeros(3)), motion, zero.at[0].set(0.5), zero, 0)
     want = {"torque": 9.0, "joint_acc": 25.0, "joint_vel": 4.0, "action_rate": 0.25, "collision": 2.0}
@@ -411,9 +403,9 @@ def test_pedipulation_curriculum_grows_only_when_asked(jitted):
     yes, no = jnp.asarray(True), jnp.asarray(False)
     motion = plain.motion(state.physics)
     growing = envs.make("anymal_pedipulation", "c", curriculum=True)
-    assert float(plain.graduate(None, good, motion, no, yes)["difficulty"]) == 0.0
-    assert float(growing.graduate(None, good, motion, no, yes)["difficulty"]) == 1.0
-    assert float(growing.graduate(None, good, motion, yes, no)["difficulty"]) == 0.0
+    assert float(plain.next_curriculum(None, good, motion, no, yes)["difficulty"]) == 0.0
+    assert float(growing.next_curriculum(None, good, motion, no, yes)["difficulty"]) == 1.0
+    assert float(growing.next_curriculum(None, good, motion, yes, no)["difficulty"]) == 0.0
     far = jax.vmap(lambda k: growing.draw_point(k, 10.0))(jax.random.split(jax.random.key(0), 300))
     assert far[:, 0].max() > 2.0 and far[:, 1].min() < -1.0
 

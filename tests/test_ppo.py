@@ -75,10 +75,11 @@ class Clockwork:
         )
 
 
-class FiveTimes:
+class Plain:
     """A 'network' whose value is obs and whose action is 0."""
 
-    reads = ("obs",)
+    def inputs(self, obs, history):
+        return {"obs": obs}
 
     def apply(self, params, inputs, method=None):
         value = inputs["obs"][..., 0]
@@ -109,7 +110,7 @@ def test_time_out_bootstraps_and_termination_does_not(bootstraps):
         }
     )
     args = dataclasses.replace(ARGS, num_steps=1)
-    _, roll, metrics = script.rollout(args, env, FiveTimes(), {}, state, jax.random.key(0))
+    _, roll, metrics = script.rollout(args, env, Plain(), {}, state, jax.random.key(0))
     np.testing.assert_allclose(roll.bootstrap[0], [4.5 if bootstraps else 0.0, 0, 0], rtol=1e-6)
     np.testing.assert_array_equal(roll.done[0], [True, True, False])
     np.testing.assert_array_equal(roll.reward[0], [1, 1, 1])
@@ -126,7 +127,14 @@ class Fixed:
         return self.out
 
 
-def batch(**fields):
+class NoMirrors:
+    """An environment of a robot without symmetry."""
+
+    mirrors = {}
+
+
+def made_up(**fields):
+    """A minibatch of two samples, zeros but for these fields."""
     zeros = jnp.zeros(2)
     base = dict(inputs={"obs": zeros}, action=jnp.zeros((2, 1)), mean=jnp.zeros((2, 1)), log_prob=zeros, value=zeros)
     return script.Rollout(**base | dict(reward=zeros, bootstrap=zeros, done=zeros) | fields)
@@ -140,14 +148,15 @@ def test_losses_by_hand():
     """
     log_std = jnp.zeros(1)
     density = -0.5 * np.log(2 * np.pi)
-    roll = batch(log_prob=density - jnp.log(jnp.array([2.0, 0.5])))
+    roll = made_up(log_prob=density - jnp.log(jnp.array([2.0, 0.5])))
     net = Fixed(jnp.zeros((2, 1)), log_std, jnp.array([1.0, -0.1]))
-    loss, _, m = script.ppo_loss(ARGS, net, {}, log_std, roll, jnp.array([1.0, -1.0]), jnp.array([2.0, -1.0]))
+    batch = roll, jnp.array([1.0, -1.0]), jnp.array([2.0, -1.0])
+    loss, m = script.ppo_loss(ARGS, NoMirrors, net, {}, log_std, batch, jax.random.key(0))
     assert m["policy_loss"] == pytest.approx(-0.2, rel=1e-5)
     assert m["value_loss"] == pytest.approx(2.025, rel=1e-5)
     assert m["entropy"] == pytest.approx(0.5 * np.log(2 * np.pi * np.e), rel=1e-6)
     assert m["clip_fraction"] == 1.0 and m["kl"] == 0.0
-    assert loss == pytest.approx(-0.2 + 2.025 - 0.01 * float(m["entropy"]), rel=1e-5)
+    assert loss == pytest.approx(-0.2 + 2.025 - 0.01 * float(m["entropy"]), rel=1e-5) and "mirror_loss" not in m
 
 
 def test_no_gradient_beyond_the_clip():
@@ -155,8 +164,9 @@ def test_no_gradient_beyond_the_clip():
 
     def policy_loss(mean, old_log_prob):
         net = Fixed(jnp.full((2, 1), mean), jnp.zeros(1), jnp.zeros(2))
-        roll = batch(action=jnp.ones((2, 1)), log_prob=jnp.full(2, old_log_prob))
-        return script.ppo_loss(ARGS, net, {}, jnp.zeros(1), roll, jnp.ones(2), jnp.zeros(2))[2]["policy_loss"]
+        roll = made_up(action=jnp.ones((2, 1)), log_prob=jnp.full(2, old_log_prob))
+        batch = roll, jnp.ones(2), jnp.zeros(2)
+        return script.ppo_loss(ARGS, NoMirrors, net, {}, jnp.zeros(1), batch, jax.random.key(0))[1]["policy_loss"]
 
     now = float(script.log_prob(jnp.zeros(1), jnp.zeros(1), jnp.ones(1)))
     slope = jax.grad(policy_loss)
@@ -226,18 +236,18 @@ def test_update_visits_every_sample_once_an_epoch(monkeypatch):
     """A loss that counts the samples it is given sees each of the T*N exactly E times."""
     args = dataclasses.replace(ARGS, num_epochs=3, mirror_coef=0.0)
 
-    def counting(args, net, params, log_std_old, roll, advantage, ret):
-        seen = jax.nn.one_hot(roll.inputs["obs"], 12).sum(0)
-        return 0.0 * params["params"]["actor"], None, {"kl": jnp.float32(0), "seen": seen}
+    def counting(args, env, net, params, log_std_old, batch, key):
+        seen = jax.nn.one_hot(batch[0].inputs["obs"], 12).sum(0)
+        return 0.0 * params["params"]["actor"], {"kl": jnp.float32(0), "seen": seen}
 
     monkeypatch.setattr(script, "ppo_loss", counting)
     monkeypatch.setattr(jnp, "mean", lambda x: x.sum(axis=(0, 1)) if x.ndim > 2 else x.mean())
-    roll = jax.tree.map(lambda _: jnp.arange(12).reshape(3, 4), batch())
+    roll = jax.tree.map(lambda _: jnp.arange(12).reshape(3, 4), made_up())
     params = {"params": {"actor": jnp.float32(0), "critic": jnp.float32(0), "log_std": jnp.float32(0)}}
     opt = optax.scale_by_adam()
     state = script.TrainState(params, opt.init(params), jnp.float32(1e-3), None, None, 0)
     zeros = jnp.zeros((3, 4))
-    *_, metrics = script.update(args, None, None, opt, state, roll, zeros, zeros, jax.random.key(0))
+    _, metrics = script.update(args, None, None, opt, state, (roll, zeros, zeros), jax.random.key(0))
     np.testing.assert_array_equal(metrics["seen"], 3 * np.ones(12))
 
 

@@ -1,4 +1,4 @@
-"""A training that breaks keeps its last good state, from which replay.py finds what went wrong."""
+"""A training that breaks keeps its last good state, from which replay.py finds the robots that failed."""
 
 import csv
 
@@ -7,43 +7,47 @@ import numpy as np
 import pytest
 
 import ppo_finetune
-from envs import records
-from results import replay
+from experiment import records
+from tools import replay
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
-    """A finished smoke run: its folder and last state."""
+    """A finished smoke run with a changed config: its folder and last state."""
     out = tmp_path_factory.mktemp("replay") / "run"
-    args = ppo_finetune.Args(preset="smoke", engine="c", run_dir=str(out))
+    args = ppo_finetune.Args(preset="smoke", engine="c", run_dir=str(out), set=("decimation=5",))
     return out, jax.tree.map(lambda x: x[0], ppo_finetune.train(args))
 
 
-def test_a_robot_that_goes_wrong_is_found_and_dumped(run, capsys):
-    """One of four environments is shot into the sky."""
+def test_a_robot_that_fails_is_found_and_dumped(run, capsys):
+    """One of four environments is shot into the sky, after a look at the sound run."""
     out, state = run
+    replay.main(replay.Args(str(out), iterations=1))
+    assert "nothing failed from iteration 4 to 4" in capsys.readouterr().out and not (out / "nan.npz").exists()
     qvel = state.env.physics.qvel.at[2, 2].set(2000.0)
     broken = state.replace(env=state.env.replace(physics=state.env.physics.replace(qvel=qvel)))
     records.save_state(out, broken, [])
     replay.main(replay.Args(str(out)))
-    assert f"iteration {int(state.iteration)}, step" in capsys.readouterr().out
+    assert f"iteration {int(state.iteration)}, step 0: 1 of 4 environments failed" in capsys.readouterr().out
     with np.load(out / "nan.npz") as dump:
         assert dump["environment"].tolist() == [2] and dump["task"] == "go1_loco"
         assert dump["qpos"].shape[1:] == (1, 19) and dump["ctrl"].shape[1:] == (1, 12)
         np.testing.assert_array_equal(dump["qvel"][0, 0], qvel[2])
     replay.main(replay.Args(str(out / "nan.npz")))
-    said = capsys.readouterr().out
-    assert "environment 2: " in said and said.count("physics step") == 4
+    out = capsys.readouterr().out
+    assert "environment 2: " in out and out.count("physics step") == 5, "it has the config of the run"
 
 
 def test_weights_that_are_not_finite_stop_the_run_and_keep_the_last_good_state(tmp_path, refused, capsys):
     out = tmp_path / "run"
     args = ppo_finetune.Args(preset="smoke", engine="c", run_dir=str(out), lr=1e11, log_every=1)
-    refused(ppo_finetune.main, args, "not finite after iteration", f"results/replay.py {out}")
+    refused(ppo_finetune.main, args, "not finite after iteration", f"tools/replay.py {out}")
     with (out / "metrics.csv").open() as file:
         count = len(list(csv.DictReader(file)))
     replay.main(replay.Args(str(out), iterations=1))
-    assert f"iteration {count - 1}: " in capsys.readouterr().out, "it goes on from before the broken iteration"
+    assert f"iteration {count - 1}: no robot failed, but the update" in capsys.readouterr().out, (
+        "it starts before the broken iteration"
+    )
 
 
 def test_bad_dumps_are_refused(tmp_path):

@@ -1,4 +1,4 @@
-"""The report's metrics on curves whose answers are known by hand, and runs that it must leave out."""
+"""The report's measures on curves with answers known by hand, and runs that it must leave out."""
 
 import json
 import shutil
@@ -6,8 +6,9 @@ import shutil
 import numpy as np
 import pytest
 
-from envs import records
-from results import report
+from experiment import records
+from results import pidm, report, tasks
+from tools import bench
 
 
 def curve(values):
@@ -98,6 +99,24 @@ def test_pages_are_what_the_runs_give():
     report.main(report.Args(check=True))
 
 
+def test_other_pages_are_what_their_records_give(monkeypatch):
+    pages = {}
+    monkeypatch.setattr(records, "replace_text", lambda path, text: pages.update({path: text}))
+    pidm.write_readme()
+    bench.write_page(report.ROOT / "results/bench")
+    assert len(pages) == 2 and all(path.read_text() == text for path, text in pages.items())
+
+
+def test_report_writes_the_same_bytes_twice(tmp_path, monkeypatch):
+    monkeypatch.setattr(report, "STUDY", tmp_path)
+    study = {"go1_loco": report.load_task(report.ROOT / "results/study/cpu/go1_loco")}
+    images = []
+    for _ in range(2):
+        report.draw_all(study)
+        images.append([(tmp_path / name).read_bytes() for name in ("curves.png", "updates.png")])
+    assert images[0] == images[1] and not (tmp_path / "sizes.png").exists()
+
+
 @pytest.fixture
 def study(tmp_path, monkeypatch):
     """Two methods of one seed each."""
@@ -176,3 +195,29 @@ def test_live_draws_until_the_run_is_over(tmp_path, capsys):
     (run / "metrics.csv").write_text("env_steps\n")
     with pytest.raises(records.UserError, match="has no rows"):
         report.main(report.Args(live=str(run)))
+
+
+def test_a_run_is_drawn_beside_the_recorded_ones(tmp_path, capsys):
+    shutil.copytree(report.ROOT / "results/tasks/go1_loco", tmp_path / "run")
+    report.main(report.Args(beside=str(tmp_path / "run")))
+    picture = tmp_path / "run/beside_recorded.png"
+    assert picture.stat().st_size > 10_000 and f"wrote {picture}" in capsys.readouterr().out
+    with pytest.raises(records.UserError, match=r"is not a run of ppo_finetune\.py"):
+        report.main(report.Args(beside=str(tmp_path)))
+
+
+def test_live_draws_a_run_of_stage_1(tmp_path):
+    """A collection has no args.json among the recorded files; its meta.json holds the arguments."""
+    folder = report.ROOT / "results/pidm/go1/explore"
+    args = json.loads((folder / "meta.json").read_text())["args"]
+    (tmp_path / "args.json").write_text(json.dumps(args))
+    shutil.copy(folder / "metrics.csv", tmp_path)
+    report.main(report.Args(live=str(tmp_path)))
+    assert (tmp_path / "curve.png").stat().st_size > 10_000
+
+
+def test_levels_of_a_recorded_task_are_drawn(tmp_path):
+    shutil.copytree(report.ROOT / "results/tasks/anymal_jump", tmp_path / "anymal_jump")
+    (tmp_path / "anymal_jump/levels.png").unlink()
+    tasks.draw_levels(tmp_path / "anymal_jump")
+    assert (tmp_path / "anymal_jump/levels.png").stat().st_size > 5000

@@ -21,12 +21,12 @@ import pytest
 import ppo_explore
 import ppo_finetune
 import pretrain_pidm
-from envs import records
+from experiment import records, run
 
 RESULT = {ppo_explore: "action.npy", pretrain_pidm: "pidm.msgpack", ppo_finetune: "policy.msgpack"}
 
 
-class Interrupted(records.Reporter):
+class Interrupted(run.Progress):
     """As if Ctrl-C came during the first row."""
 
     def show(self, row, speed):
@@ -60,7 +60,7 @@ def whole(collection, tmp_path_factory):
     """whole(script): folder of a finished run and its arguments, cached."""
 
     @functools.cache
-    def run(script):
+    def finished(script):
         if script is ppo_explore:
             return collection
         changes = {"data": str(collection[0])} if script is pretrain_pidm else {}
@@ -69,7 +69,7 @@ def whole(collection, tmp_path_factory):
         script.main(args)
         return out, args
 
-    return run
+    return finished
 
 
 @pytest.mark.parametrize("script", RESULT, ids=lambda script: script.__name__)
@@ -77,7 +77,7 @@ def test_resumed_run_has_the_same_bits(script, whole, tmp_path, monkeypatch):
     want, args = whole(script)
     broken = tmp_path / "broken"
     with monkeypatch.context() as patch:
-        patch.setattr(records, "Reporter", Interrupted)
+        patch.setattr(run, "Progress", Interrupted)
         script.main(dataclasses.replace(args, run_dir=str(broken)))
     assert len(rows_of(broken)) == 1 < len(rows_of(want))
     script.main(script.Args(resume=str(broken)))
@@ -141,4 +141,37 @@ def test_what_cannot_be_resumed_is_refused(whole, tmp_path, refused):
     (out / records.STATE).write_bytes(state)
     (out / "args.json").write_text("{")
     check("args.json is damaged")
+    (out / "args.json").write_text(json.dumps(record | {"lr": "fast"}))
+    check("args.json is damaged")
     assert (out / records.STATE).read_bytes() == state
+
+
+@pytest.mark.parametrize("script", RESULT, ids=lambda script: script.__name__)
+def test_arguments_of_another_version_are_refused(script, tmp_path, refused):
+    """A name that is unknown today, or one that was unknown then, is named and never filled in silently."""
+    record = dataclasses.asdict(script.Args()) | {"config": {}, "versions": {}}
+    missing = {name: value for name, value in record.items() if name != "seed"}
+    for content, name in (
+        (record | {"core_scale": 1.0}, "core_scale"),
+        (missing, "seed"),
+        (missing | {"warm": 1}, "seed, warm"),
+    ):
+        (tmp_path / "args.json").write_text(json.dumps(content))
+        refused(script.main, script.Args(resume=str(tmp_path)), "args.json is of another version", f"in {name};")
+    assert [path.name for path in tmp_path.iterdir()] == ["args.json"]
+
+
+@pytest.mark.parametrize(
+    ("script", "changes", "flag"),
+    [
+        (ppo_finetune, {"lr": 1e-4}, "--lr"),
+        (ppo_finetune, {"set": ("noise=0.5",)}, "--set"),
+        (ppo_finetune, {"run_dir": "elsewhere"}, "--run-dir"),
+        (ppo_explore, {"num_envs": 8}, "--num-envs"),
+        (pretrain_pidm, {"mirror": False}, "--mirror"),
+    ],
+    ids=lambda value: getattr(value, "__name__", None),
+)
+def test_a_second_argument_beside_resume_is_refused(script, changes, flag, tmp_path, refused):
+    refused(script.main, script.Args(resume=str(tmp_path), **changes), f"{flag} cannot change with --resume")
+    assert not list(tmp_path.iterdir())

@@ -1,9 +1,8 @@
-"""The script end to end at smoke size, and what it says to bad input."""
+"""Stage 3 and play.py end to end at smoke size, and what they say to bad input."""
 
 import csv
 import dataclasses
 import json
-import os
 import signal
 import subprocess
 import sys
@@ -15,16 +14,18 @@ import numpy as np
 import pytest
 
 import envs
+import play
 import ppo_finetune as script
-from envs import records
+from envs import render
+from experiment import records
 
 ROOT = Path(__file__).resolve().parent.parent
 SMOKE = script.Args(preset="smoke")
 
 
 def run(*arguments, **kwargs):
-    """The script in a process of its own. Returns the finished process."""
-    command = [sys.executable, "ppo_finetune.py", *map(str, arguments)]
+    """A script with its arguments in a process of its own. Returns the finished process."""
+    command = [sys.executable, *map(str, arguments)]
     return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300, check=False, **kwargs)
 
 
@@ -70,7 +71,7 @@ def test_same_seed_same_weights(trained, tmp_path):
 def test_seeds_whose_folder_is_taken_are_refused_together(trained, tmp_path, refused):
     (tmp_path / "seed1").mkdir()
     (tmp_path / "seed1/metrics.csv").write_text("old\n")
-    refused(script.main, dataclasses.replace(SMOKE, num_seeds=2, run_dir=str(tmp_path)), "seed1 holds a run already")
+    refused(script.main, dataclasses.replace(SMOKE, num_seeds=2, run_dir=str(tmp_path)), "seed1 holds a run")
     assert [path.name for path in tmp_path.iterdir()] == ["seed1"]
 
 
@@ -104,9 +105,9 @@ def test_first_clocks_are_spread(jitted):
     assert clocks.min() < 200 and clocks.max() > 800 and clocks.max() < env.episode_steps
 
 
-def test_eval_prints_and_draws(trained):
+def test_play_prints_and_draws(trained):
     out, _ = trained
-    process = run("--task", "g1_loco", "--eval", out / "policy.msgpack", "--eval-envs", 2)
+    process = run("play.py", out / "policy.msgpack", "--episodes", 2)
     assert process.returncode == 0, process.stderr
     assert "lin_vel_error" in process.stdout and "falls" in process.stdout
     assert (out / "rollout.png").stat().st_size > 10_000 and (out / "rollout.gif").read_bytes()[:4] == b"GIF8"
@@ -114,29 +115,84 @@ def test_eval_prints_and_draws(trained):
     assert 0 < report["task"]["episode_seconds"] < 20 and report["task"]["falls"] == 1.0
 
 
-def test_pictures_without_opengl(trained, tmp_path):
-    """Where no OpenGL works the same files are drawn by matplotlib."""
-    target = tmp_path / "policy.msgpack"
-    target.write_bytes((trained[0] / "policy.msgpack").read_bytes())
-    environ = os.environ | {"MUJOCO_GL": "disable"}
-    process = run("--task", "g1_loco", "--eval", target, "--eval-envs", 2, env=environ)
-    assert process.returncode == 0, process.stderr
-    assert "stick figures" in process.stdout and (tmp_path / "rollout.png").stat().st_size > 5000
+def test_pictures_without_opengl(jitted, tmp_path, monkeypatch, capsys):
+    """Where no OpenGL works, all of which are tried in processes of their own, matplotlib draws the same files."""
+    env = jitted("g1_loco").env
+    physics = jax.tree.map(lambda x: x[0], jitted("g1_loco").start(1).physics)
+    monkeypatch.setattr(subprocess, "run", lambda *words, **kwargs: subprocess.CompletedProcess(words, 1, "", ""))
+    for picture in render.film(env, np.tile(physics.qpos, (60, 1)), physics, tmp_path):
+        assert picture.stat().st_size > 2000
+    assert {path.name for path in tmp_path.iterdir()} == {"rollout.png", "rollout.gif"}
+    assert "stick figures" in capsys.readouterr().out
 
 
 def test_wrong_policies_are_refused(trained, tmp_path, refused):
     policy = trained[0] / "policy.msgpack"
 
-    def check(path, *words, task="g1_loco"):
-        refused(script.main, script.Args(task=task, eval=str(path)), *words)
+    def check(path, *words, **changes):
+        refused(play.main, play.Args(policy=str(path), **changes), *words)
 
-    check(policy, "is a policy for g1_loco, not for go1_loco", task="go1_loco")
     check(tmp_path / "none.msgpack", "cannot read policy", "No such file")
     cut = tmp_path / "cut.msgpack"
     cut.write_bytes(policy.read_bytes()[:-100])
     check(cut, "damaged")
-    refused(script.main, script.Args(task="g1_loco", eval=str(policy), level=3), "g1_loco has no levels")
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["cut.msgpack"]
+    params, meta = records.load(policy, "policy")
+    records.save(tmp_path / "task.msgpack", params, meta | {"task": "spot_loco"})
+    check(tmp_path / "task.msgpack", "is a policy for 'spot_loco'", "g1_loco")
+    records.save(tmp_path / "other.msgpack", params, meta | {"task": "go1_loco"})
+    check(tmp_path / "other.msgpack", "this task needs")
+    check(policy, "g1_loco has no level 3", level=3)
+    check(policy, "--episodes must be at least 1, not 0", episodes=0)
+    check(policy, "--viewer and --web exclude each other", viewer=True, web=True)
+    check(policy, "unknown option 'gravity'", set=("gravity=1",))
+    assert not [path for path in tmp_path.iterdir() if path.suffix != ".msgpack"]
+
+
+# --- --set ---
+
+
+def test_set_reaches_the_environment_and_the_records(tmp_path, monkeypatch):
+    """The numbers typed after --set hold in the training, and are recorded; play.py then starts from them."""
+    out, words = tmp_path / "run", ("push_velocity=0.25", "friction=0.3,1.2", "weights.slip=-0.5")
+    made, make = [], envs.make
+    monkeypatch.setattr(envs, "make", lambda *args, **fields: made.append(make(*args, **fields)) or made[-1])
+    script.main(dataclasses.replace(SMOKE, set=words, run_dir=str(out)))
+    (env,) = made
+    usual = envs.TASKS["go1_loco"][1]
+    changes = {"push_velocity": 0.25, "friction": (0.3, 1.2), "weights": usual.weights | {"slip": -0.5}}
+    assert env.config == dataclasses.replace(usual, **changes)
+    record = json.loads((out / "args.json").read_text())
+    assert record["set"] == list(words) and record["config"] == json.loads(json.dumps(dataclasses.asdict(env.config)))
+    script.main(script.Args(resume=str(out)))
+    assert made[1].config == env.config
+    played, *_ = play.load_policy(out / "policy.msgpack", "c", ("friction=0.5,0.5",), noise=0.0)
+    assert played.config == dataclasses.replace(env.config, friction=(0.5, 0.5), noise=0.0)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["gravity=3"], "unknown option 'gravity'; choose one of added_mass"),
+        (["friction=abc"], "friction takes two numbers like 0.3,1.2, not 'abc'"),
+        (["weights.glide=1"], "unknown option 'weights.glide'; choose one of weights."),
+        (["ppo={}"], "ppo cannot be set"),
+        (["friction"], "--set takes NAME=VALUE, not 'friction'"),
+        (["noise=0.5", "push_seconds=inf,inf"], "push_seconds takes two numbers"),
+    ],
+)
+def test_what_cannot_be_set_is_refused(words, said, tmp_path, refused):
+    refused(script.main, dataclasses.replace(SMOKE, set=tuple(words), run_dir=str(tmp_path / "run")), said)
+    assert not (tmp_path / "run").exists()
+
+
+def test_set_from_the_command_line():
+    """In a process of its own, with several values behind one flag; what a user sees of a refusal."""
+    for name in ("ppo_finetune.py", "ppo_explore.py"):
+        process = run(name, "--preset", "smoke", "--set", "noise=0.5", "push_axes=3", "friction=0.3,1.2")
+        assert process.returncode == 2 and process.stderr == "error: push_axes takes 2 or 6, not '3'\n", process.stderr
+
+
+# --- Faults ---
 
 
 @pytest.mark.parametrize(
@@ -166,10 +222,14 @@ def test_out_of_memory_names_what_to_lower(tmp_path, refused, monkeypatch):
 def test_a_run_is_not_overwritten(trained):
     """In a process of its own: what a user sees of a refusal."""
     before = (trained[0] / "metrics.csv").read_bytes()
-    process = run("--preset", "smoke", "--task", "g1_loco", "--run-dir", trained[0])
+    process = run("ppo_finetune.py", "--preset", "smoke", "--task", "g1_loco", "--run-dir", trained[0])
     assert process.returncode == 2 and "Traceback" not in process.stderr
     assert [text.startswith("error: ") for text in process.stderr.splitlines()] == [True]
     assert "--force" in process.stderr and (trained[0] / "metrics.csv").read_bytes() == before
+
+
+def start_run(folder, **changes):
+    records.start_runs([dataclasses.replace(SMOKE, run_dir=str(folder), **changes)], SMOKE)
 
 
 def test_force_takes_the_old_results_away(tmp_path):
@@ -177,9 +237,9 @@ def test_force_takes_the_old_results_away(tmp_path):
     for name in (*records.RESULTS, records.STATE, "mine.txt"):
         (tmp_path / name).write_text("old")
     with pytest.raises(records.UserError, match="--force"):
-        records.start_run(SMOKE, SMOKE, tmp_path, force=False)
+        start_run(tmp_path)
     assert len(list(tmp_path.iterdir())) == len(records.RESULTS) + 2
-    records.start_run(SMOKE, SMOKE, tmp_path, force=True)
+    start_run(tmp_path, force=True)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["args.json", "mine.txt"]
 
 
@@ -188,11 +248,11 @@ def test_any_result_makes_a_folder_a_run(name, tmp_path):
     """Weights alone, say of somebody else's training, are not overwritten either."""
     (tmp_path / name).write_text("old")
     with pytest.raises(records.UserError, match="--force"):
-        records.start_run(SMOKE, SMOKE, tmp_path, force=False)
+        start_run(tmp_path)
 
 
 def test_unknown_preset_lists_the_right_ones():
-    process = run("--preset", "huge")
+    process = run("ppo_finetune.py", "--preset", "huge")
     assert process.returncode == 2 and "smoke" in process.stderr and "Traceback" not in process.stderr
 
 

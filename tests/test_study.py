@@ -1,37 +1,46 @@
-"""The study runs what is missing, goes on with what broke, and stops when its time is over."""
+"""The study trains what is missing, resumes what was interrupted, and stops when its time is over."""
+
+import dataclasses
+import json
 
 import pytest
+import tyro
 
-from envs import records
-from results import report, study
+import envs
+import play
+import ppo_finetune
+from experiment import records
+from results import grid, recording, report, study
+
+FREE = {"run_dir", "save_minutes", "shuffle_blocks"}  # arguments that may differ from those of a recorded run
 
 
 @pytest.fixture
 def runs(tmp_path, monkeypatch):
-    """A study in an empty folder; the training is replaced by one that writes half of a run and then the rest."""
+    """A study in an empty folder, with a stand-in for the training that writes half of a run, and then the rest."""
     monkeypatch.setattr(study, "ROOT", tmp_path)
     calls = []
 
     def finetune(words, log, seconds):
         calls.append(words)
         folder = tmp_path / (words[-1] if words[0] == "--resume" else words[-2])
-        broke = len(calls) == 1
+        interrupted = len(calls) == 1
         (folder / "args.json").write_text('{"total_steps": 100}')
-        (folder / "metrics.csv").write_text(f"env_steps\n{50 if broke else 100}\n")
+        (folder / "metrics.csv").write_text(f"env_steps\n{50 if interrupted else 100}\n")
         (folder / records.STATE).write_bytes(b"")
-        return not broke
+        return not interrupted
 
-    def evaluate(task, run, kept, names, log):
-        kept.mkdir(parents=True)
+    def evaluate(run, folder, names, log):
+        folder.mkdir(parents=True)
         for name in names:
-            (kept / name).touch()
+            (folder / name).touch()
 
     monkeypatch.setattr(study.recording, "finetune", finetune)
     monkeypatch.setattr(study.recording, "evaluate", evaluate)
     return calls
 
 
-def test_a_study_goes_on_where_it_broke(runs, capsys):
+def test_a_study_resumes_what_was_interrupted(runs, capsys):
     args = study.Args(tasks=("go1_loco",), methods=("mlp", "pidm_actor"), seeds=(3,))
     study.main(args)
     assert "out of time" in capsys.readouterr().out and len(runs) == 1
@@ -41,7 +50,7 @@ def test_a_study_goes_on_where_it_broke(runs, capsys):
     first, again, other = runs
     assert first[:6] == ["--task", "go1_loco", "--preset", "cpu", "--seed", "3"]
     assert again == ["--resume", "runs/study/cpu/go1_loco/mlp/seed3"]
-    assert other[6:10] == ["--pretrained", "assets/pidm/go1.msgpack", "--init", "actor"]
+    assert other[6:10] == ["--pretrained", "assets/pidm/go1.msgpack", "--load-into", "actor"]
     study.main(args)
     assert len(runs) == 3, "nothing is run twice"
     study.show_status(study.cells(args))
@@ -56,7 +65,7 @@ def test_no_run_starts_when_time_is_over(runs, capsys):
 def test_list_is_a_command_a_line(runs, capsys):
     study.main(study.Args(list=True))
     lines = capsys.readouterr().out.splitlines()
-    assert len(lines) == len(set(lines)) == 5 * sum(map(len, study.GRID.values())) and not runs
+    assert len(lines) == len(set(lines)) == 5 * sum(len(task.methods) for task in grid.TASKS.values()) and not runs
 
 
 def test_unknown_names_are_refused():
@@ -64,6 +73,55 @@ def test_unknown_names_are_refused():
         study.main(study.Args(tasks=("walk",)))
 
 
-def test_every_method_is_reported():
-    assert study.METHODS.keys() == report.METHODS.keys()
-    assert study.GRID.keys() == report.TASKS.keys()
+def test_scripts_are_stopped_and_failures_reported(tmp_path):
+    assert recording.run_script(["-c", ""])
+    assert not recording.run_script(["-c", "import time; time.sleep(60)"], seconds=0.5)
+    with (tmp_path / "log.txt").open("w") as log, pytest.raises(records.UserError, match=r"code 3; see .*log\.txt"):
+        recording.run_script(["-c", "raise SystemExit(3)"], log)
+
+
+def test_a_policy_is_evaluated_and_its_small_files_kept(tmp_path, monkeypatch):
+    commands = []
+    monkeypatch.setattr(recording, "run_script", lambda words, log: commands.append(words))
+    monkeypatch.setattr(recording, "ROOT", tmp_path)
+    (tmp_path / "runs/x").mkdir(parents=True)
+    (tmp_path / "runs/x/eval.json").write_text("{}")
+    recording.evaluate("x", tmp_path / "kept/x", ("eval.json",))
+    assert commands == [["play.py", "runs/x/policy.msgpack"]] and (tmp_path / "kept/x/eval.json").read_text() == "{}"
+    assert tyro.cli(play.Args, args=commands[0][1:]).episodes == 64, "as in the recorded runs"
+
+
+def test_study_and_report_share_one_table():
+    assert study.METHODS is report.METHODS is grid.METHODS and study.TASKS is report.TASKS is grid.TASKS
+    assert grid.TASKS.keys() == envs.TASKS.keys()
+    used = {name for task in grid.TASKS.values() for name in task.methods}
+    assert used == grid.METHODS.keys(), "every method has a task, and every task's methods exist"
+
+
+def parsed(task, method):
+    """Arguments of ppo_finetune.py for a run of the study, as its command line gives them."""
+    words = study.Cell("cpu", task, method, 0).words()
+    return ppo_finetune.merge(tyro.cli(ppo_finetune.Args, args=words), envs.TASKS[task][1].ppo)
+
+
+@pytest.mark.parametrize(("task", "method"), [(task, m) for task, row in grid.TASKS.items() for m in row.methods])
+def test_flags_give_the_arguments_of_recorded_runs(task, method, tmp_path, monkeypatch):
+    """Flags parse. If the run is recorded, a new one has its arguments, under their new names, and its config."""
+    monkeypatch.setattr(study, "ROOT", tmp_path)
+    args = parsed(task, method)
+    path = report.STUDY / "cpu" / task / method / "seed0/args.json"
+    if not path.exists():
+        return
+    record, today = json.loads(path.read_text()), json.loads(json.dumps(dataclasses.asdict(args)))
+    record = {"load_into": record.get("init"), "weight_init": record.get("fresh", "orthogonal")} | record  # old names
+    shared = today.keys() & record.keys() - FREE
+    assert {name: today[name] for name in shared} == {name: record[name] for name in shared} and len(shared) > 24
+    assert json.loads(json.dumps(dataclasses.asdict(envs.TASKS[task][1]))) == record["config"]
+
+
+def test_pretrained_weights_exist():
+    """Those of parts of the data are made by pidm.py --stages sizes."""
+    for task, row in grid.TASKS.items():
+        for method in row.methods:
+            if grid.METHODS[method].group != "sizes" and (path := parsed(task, method).pretrained):
+                assert (study.ROOT / path).exists()

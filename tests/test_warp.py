@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 import envs
-from envs import devices
+from experiment import devices
+from experiment.run import Progress
 
 pytest.importorskip("warp")
 
@@ -41,9 +42,9 @@ def test_overflow_is_seen_and_reported(capsys):
     state = jax.jit(jax.vmap(env.step))(state, jnp.zeros((2, env.action_dim)))
     assert state.metrics["overflow"].all()
     row = {name: float(value.mean()) for name, value in state.metrics.items()}
-    with envs.records.Reporter(1, ()) as reporter:
+    with Progress(1, ()) as progress:
         for _ in range(2):
-            reporter.show(row | {"env_steps": 0, "iteration": 1, "seconds": 0.0}, 0.0)
+            progress.show(row | {"env_steps": 0, "iteration": 1, "seconds": 0.0}, 0.0)
     assert capsys.readouterr().out.count("no room for some contacts") == 1
 
 

@@ -1,9 +1,14 @@
 """A person's commands reach the robot, in a window or a browser; films and TensorBoard files are written."""
 
+import csv
 import dataclasses
 import shutil
+import signal
+import socket
 import struct
+import subprocess
 import sys
+import urllib.request
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -14,12 +19,14 @@ import pytest
 from PIL import Image
 
 import envs
-import ppo_finetune as script
-from envs import watch
+import play
+import ppo_finetune
+from experiment import records
+from tools import viewer
 
 ROOT = Path(__file__).resolve().parent.parent
 WALKER = ROOT / "results/tasks/go1_loco/policy.msgpack"
-ARGS = script.Args(task="go1_loco", eval=str(WALKER))
+ARGS = play.Args(str(WALKER))
 
 
 def stand(state):
@@ -29,28 +36,25 @@ def stand(state):
 @pytest.fixture(scope="module")
 def walker():
     """The recorded Go1, watched."""
-    env = envs.make("go1_loco", "c")
-    net, params = script.load_policy(ARGS, env)
-    return watch.Watched(env, lambda s: net.apply(params, {"obs": s.obs}, method=net.mean))
+    env, net, params, _ = play.load_policy(WALKER, "c")
+    return viewer.Watched(env, lambda s: net.apply(params, {"obs": s.obs}, method=net.mean))
 
 
 @pytest.fixture(scope="module")
 def climber():
-    return watch.Watched(envs.make("anymal_climb_up", "c", rough=0.0), stand, level=2)
+    return viewer.Watched(envs.make("anymal_climb_up", "c", rough=0.0), stand, level=2)
 
 
 @pytest.mark.parametrize(("task", "block"), [("go1_loco", "command"), ("anymal_pedipulation", "target")])
 def test_a_command_changes_the_task_and_its_part_of_the_observation(task, block, jitted):
-    """What was there before the command is what a task of that command would have shown; nothing else changes."""
+    """The observation shows the command, and is otherwise the same."""
     env = jitted(task).env
     before = jax.jit(env.reset)(jax.random.key(0))
     wanted = np.array([0.3, -0.2, 0.1])
-    after = env.tell(before, jnp.asarray(wanted))
-    stop = np.cumsum([env.width(kind) for kind, _ in env.OBS.values()])
-    where = list(env.OBS).index(block)
+    after, where = env.with_command(before, jnp.asarray(wanted)), env.obs_slices()[block]
     changed = np.flatnonzero(np.asarray(before.obs != after.obs))
-    assert changed.size and set(changed) <= set(range(stop[where] - 3, stop[where]))
-    shown = np.asarray(after.obs[stop[where] - 3 : stop[where]]) / np.array(env.OBS[block][1])
+    assert changed.size and set(changed) <= set(range(len(before.obs))[where])
+    shown = np.asarray(after.obs[where]) / np.array(env.OBS[block][1])
     if task == "anymal_pedipulation":  # a point of the world, seen from a base that stands level
         yaw = float(2 * np.arctan2(before.physics.qpos[6], before.physics.qpos[3]))
         turn = np.array([[np.cos(yaw), np.sin(yaw), 0], [-np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])
@@ -58,16 +62,16 @@ def test_a_command_changes_the_task_and_its_part_of_the_observation(task, block,
     np.testing.assert_allclose(shown, wanted, atol=1e-5)
 
 
-def test_the_robot_goes_where_it_is_told(walker):
+def test_the_robot_follows_its_command(walker):
     """Forward, then backward: the recorded policy follows within 0.25 m/s."""
     for command in (0.8, -0.6):
-        walker.want(0, command)
+        walker.set_command(0, command)
         speeds = []
         for _ in range(120):
-            walker.tick()
+            walker.step()
             speeds.append(float(walker.env.motion(walker.state.physics).lin_vel[0]))
         assert abs(np.mean(speeds[60:]) - command) < 0.25, (command, np.mean(speeds[60:]))
-    walker.show()
+    walker.update_picture()
     np.testing.assert_allclose(walker.data.xpos[1], walker.state.physics.qpos[:3], atol=1e-6)
 
 
@@ -81,9 +85,9 @@ def test_keys(walker):
         walker.press(264)
     assert walker.command[0] == -1.0, "within its range"
     before = np.asarray(walker.state.physics.qvel)
-    walker.press(watch.PUSH_KEY)
-    assert np.hypot(*walker.kick) == pytest.approx(watch.PUSH)
-    walker.tick()
+    walker.press(viewer.PUSH_KEY)
+    assert np.hypot(*walker.kick) == pytest.approx(viewer.PUSH)
+    walker.step()
     assert not walker.kick.any() and np.hypot(*(walker.state.physics.qvel - before)[:2]) > 0.3
 
 
@@ -93,70 +97,104 @@ def test_levels(climber):
 
     heights = []
     for level in (2, 9, 99):
-        climber.to_level(level)
-        climber.tick()
+        climber.set_level(level)
+        climber.step()
         assert int(climber.state.task.level) == min(level, 9)
         heights.append(top())
     climber.press(267)
-    climber.tick()
+    climber.step()
     assert int(climber.state.task.level) == 8 and heights[0] < heights[1]
     climber.paused, clock = True, int(climber.state.clock)
-    climber.tick()
+    climber.step()
     assert int(climber.state.clock) == clock
     climber.paused = False
-    climber.tick()
+    climber.step()
     assert int(climber.state.clock) == clock + 1
-    climber.show()
+    climber.update_picture()
     np.testing.assert_allclose(climber.data.mocap_pos, climber.state.physics.mocap_pos, atol=1e-6)
 
 
 class Gui:
-    """Stands for viser's: remembers what each control does."""
+    """A stand-in for viser's, which remembers the callback of each control."""
 
     def __init__(self):
-        self.does = {}
+        self.callbacks = {}
 
     def control(self, name, *_, **__):
-        return SimpleNamespace(**dict.fromkeys(("on_update", "on_click"), lambda do: self.does.update({name: do})))
+        return SimpleNamespace(**dict.fromkeys(("on_update", "on_click"), lambda do: self.callbacks.update({name: do})))
 
     add_slider = add_checkbox = add_button = control
 
     def use(self, name, value=None):
-        self.does[name](SimpleNamespace(target=SimpleNamespace(value=value)))
+        self.callbacks[name](SimpleNamespace(target=SimpleNamespace(value=value)))
 
 
 def test_controls_of_the_page(walker, climber):
     gui = Gui()
-    watch.add_controls(gui, walker)
-    assert "level" not in gui.does
+    viewer.add_controls(gui, walker)
+    assert "level" not in gui.callbacks
     gui.use("turning [rad/s]", 0.7)
     gui.use("pause", True)
     assert walker.command[2] == 0.7 and walker.paused
     gui.use("pause", False)
     gui.use("start again")
-    walker.tick()
+    walker.step()
     assert int(walker.state.clock) == 0
     gui = Gui()
-    watch.add_controls(gui, climber)
+    viewer.add_controls(gui, climber)
     gui.use("level", 7)
-    climber.tick()
-    assert int(climber.state.task.level) == 7 and not climber.env.COMMAND
+    climber.step()
+    assert int(climber.state.task.level) == 7 and not climber.env.COMMAND_RANGES
 
 
-def test_the_page_is_served(walker):
+@pytest.fixture
+def port():
+    """A free port."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        return server.getsockname()[1]
+
+
+def test_the_page_is_served(walker, port, capsys):
     """Needs requirements-watch.txt: the page answers while the robot walks on."""
     pytest.importorskip("mjviser")
-    import urllib.request
-
     start, pages = int(walker.state.clock), []
 
-    def alive():
-        with urllib.request.urlopen("http://localhost:8123", timeout=20) as page:
+    def running():
+        with urllib.request.urlopen(f"http://127.0.0.1:{port}", timeout=20) as page:
             pages.append(page.read())
         return len(pages) < 4
 
-    watch.browser(walker, port=8123, alive=alive)
+    viewer.browser(walker, port=port, running=running)
     assert b"<html" in pages[0].lower() and int(walker.state.clock) == start + 3
+    assert f"open http://127.0.0.1:{port} in a browser; Ctrl-C ends" in capsys.readouterr().out
+
+
+def test_two_pages_are_served_at_once(port):
+    """Needs requirements-watch.txt: the second --web takes another port and prints it; Ctrl-C ends both."""
+    pytest.importorskip("mjviser")
+    command = [sys.executable, "play.py", str(WALKER), "--web", "--engine", "c", "--port", str(port)]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
+    processes = [subprocess.Popen(command, cwd=ROOT, **pipes) for _ in range(2)]
+    try:
+        lines = [next(line for line in process.stdout if line.startswith("open ")) for process in processes]
+        urls = [line.split()[1] for line in lines]
+        assert f"http://127.0.0.1:{port}" in urls and len({*urls}) == 2
+        assert sum(f"(port {port} is taken)" in line for line in lines) == 1
+        for url in urls:
+            with urllib.request.urlopen(url, timeout=20) as page:
+                assert b"<html" in page.read().lower()
+    finally:
+        for process in processes:
+            process.send_signal(signal.SIGINT)
+    assert [process.wait(60) for process in processes] == [0, 0]
+
+
+def test_addresses():
+    viewer.check_address("127.0.0.1", 8080)
+    viewer.check_address("localhost", 8080)
+    for host, port, words in (("192.0.2.1", 8080, "--host 192.0.2.1"), ("127.0.0.1", 70000, "--port must be within")):
+        with pytest.raises(records.UserError, match=words):
+            viewer.check_address(host, port)
 
 
 def test_what_cannot_be_watched_is_refused(refused, monkeypatch):
@@ -164,14 +202,13 @@ def test_what_cannot_be_watched_is_refused(refused, monkeypatch):
         return dataclasses.replace(ARGS, **changes)
 
     monkeypatch.setitem(sys.modules, "mjviser", None)
-    refused(script.main, change(web=True), "requirements-watch.txt")
+    refused(play.main, change(web=True), "requirements-watch.txt")
     monkeypatch.setattr(sys, "platform", "linux")
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
-    refused(script.main, change(viewer=True), "needs a display", "--web")
-    refused(script.main, change(viewer=True, web=True), "--viewer and --web", "ask for one")
-    refused(script.main, script.Args(web=True), "--eval POLICY")
-    refused(script.main, change(web=True, level=3), "no levels")
+    refused(play.main, change(viewer=True), "needs a display", "--web")
+    refused(play.main, change(viewer=True, web=True), "--viewer and --web")
+    refused(play.main, change(web=True, level=3), "no level")
 
 
 def test_films(tmp_path, monkeypatch, capsys):
@@ -186,7 +223,7 @@ def test_films(tmp_path, monkeypatch, capsys):
     kinds = [".gif"] + ([".mp4"] if shutil.which("ffmpeg") else [])
     for kind in kinds:
         path = tmp_path / f"new/walk{kind}"
-        script.main(dataclasses.replace(ARGS, video=str(path)))
+        play.main(dataclasses.replace(ARGS, video=str(path)))
         assert f"wrote {path}" in capsys.readouterr().out and path.stat().st_size > 1000
     with Image.open(tmp_path / "new/walk.gif") as gif:
         assert gif.n_frames == len(drawn[0]) == 500 and gif.info["duration"] == 40
@@ -195,7 +232,7 @@ def test_films(tmp_path, monkeypatch, capsys):
 
 def test_films_that_cannot_be_written(tmp_path, refused, monkeypatch):
     def check(name, *words):
-        refused(script.main, dataclasses.replace(ARGS, video=str(tmp_path / name)), *words)
+        refused(play.main, dataclasses.replace(ARGS, video=str(tmp_path / name)), *words)
 
     check("a.avi", "must end in .gif or .mp4")
     monkeypatch.setattr(shutil, "which", lambda name: None)
@@ -203,7 +240,7 @@ def test_films_that_cannot_be_written(tmp_path, refused, monkeypatch):
 
 
 def scalars(path):
-    """(step, name) -> value of an event file: records of a length, its checksum, a message and its checksum."""
+    """Values of an event file by (step, name). It is a series of a length, its checksum, a message and its checksum."""
     from tensorboardX.proto.event_pb2 import Event
 
     blob, found = path.read_bytes(), {}
@@ -218,10 +255,8 @@ def scalars(path):
 def test_tensorboard_has_every_row(tmp_path):
     """Needs requirements-watch.txt."""
     pytest.importorskip("tensorboardX")
-    import csv
-
-    args = script.Args(preset="smoke", run_dir=str(tmp_path), tensorboard=True)
-    script.main(args)
+    args = ppo_finetune.Args(preset="smoke", run_dir=str(tmp_path), tensorboard=True)
+    ppo_finetune.main(args)
     (path,) = tmp_path.glob("events.out.tfevents.*")
     found = scalars(path)
     with (tmp_path / "metrics.csv").open() as file:
@@ -229,13 +264,13 @@ def test_tensorboard_has_every_row(tmp_path):
     want = {(int(float(row["env_steps"])), name): float(value) for row in rows for name, value in row.items()}
     assert found.keys() == want.keys() and len(rows) == 2
     np.testing.assert_allclose([found[key] for key in want], list(want.values()), rtol=1e-5)
-    script.main(dataclasses.replace(args, tensorboard=False, force=True))
+    ppo_finetune.main(dataclasses.replace(args, tensorboard=False, force=True))
     assert not list(tmp_path.glob("events.*")), "the files of the run that was overwritten are gone"
 
 
 def test_tensorboard_without_its_package_loses_nothing(tmp_path, refused, monkeypatch):
-    args = script.Args(preset="smoke", run_dir=str(tmp_path))
+    args = ppo_finetune.Args(preset="smoke", run_dir=str(tmp_path))
     (tmp_path / "metrics.csv").write_text("iteration\n1\n")
     monkeypatch.setitem(sys.modules, "tensorboardX", None)
-    refused(script.main, dataclasses.replace(args, tensorboard=True, force=True), "requirements-watch.txt")
+    refused(ppo_finetune.main, dataclasses.replace(args, tensorboard=True, force=True), "requirements-watch.txt")
     assert (tmp_path / "metrics.csv").read_text() == "iteration\n1\n"

@@ -1,13 +1,12 @@
-"""What bench.py compares with: PPO of rsl_rl and of Brax. Runs in an environment of its own, which has those packages:
+"""PPO of rsl_rl and of Brax, for bench.py to compare with. They need an environment of their own:
 
     python3 -m venv .peers
     .peers/bin/pip install -r requirements.txt -r requirements-peers.txt
-    .venv/bin/python results/bench.py --peers .peers/bin/python
+    .venv/bin/python tools/bench.py --parts peers --peers .peers/bin/python
 
 rsl_rl      its PPO in PyTorch on our go1_loco: the same physics, rewards, networks and minibatches
-playground  MuJoCo Playground's Go1JoystickFlatTerrain on MJX, learned by Brax PPO with Playground's own settings, but
-            for num_envs environments. Its meshes, which are only drawn, are replaced by a tetrahedron: they are not in
-            the package.
+playground  MuJoCo Playground's Go1JoystickFlatTerrain on MJX with Brax PPO and Playground's own settings, but for
+            num_envs environments. Its meshes, which are only drawn, are not in the package; tetrahedra replace them.
 """
 
 import argparse
@@ -23,7 +22,7 @@ sys.path.insert(0, str(ROOT))
 
 
 def our_env(task, num_envs):
-    """Our task as rsl_rl's VecEnv: arrays go to PyTorch and back without a copy where they can."""
+    """Our task as a VecEnv of rsl_rl. Arrays go to PyTorch and back, without a copy if possible."""
     import jax
     import torch
     from rsl_rl.env import VecEnv
@@ -54,7 +53,7 @@ def our_env(task, num_envs):
 
 
 def rsl_rl(task, num_envs, hidden, iterations):
-    """Steps per second of rsl_rl's runner on our environment, first iterations left out."""
+    """Steps per second of rsl_rl's runner on our environment, after its first iterations."""
     from rsl_rl.runners import OnPolicyRunner
 
     network = {"class_name": "MLPModel", "hidden_dims": hidden, "activation": "elu"}
@@ -81,7 +80,7 @@ def tetrahedron():
 
 
 def playground(num_envs):
-    """Steps per second of Brax PPO on Playground's Go1: of the median of six iterations, the first of which compile."""
+    """Steps per second of Brax PPO on Playground's Go1, by the median of six iterations, as the first ones compile."""
     import jax
     import numpy as np
     from brax.training.agents.ppo import networks, train
@@ -89,12 +88,12 @@ def playground(num_envs):
     from mujoco_playground._src.locomotion.go1 import base, joystick
     from mujoco_playground.config import locomotion_params
 
-    # Brax 0.14.2 calls what JAX 0.10 no longer has; one device is all there is
+    # Brax 0.14.2 calls a function that JAX 0.10 has removed; here it serves one device
     jax.device_put_replicated = lambda tree, devices: jax.tree.map(lambda x: jax.numpy.asarray(x)[None], tree)
     name = "Go1JoystickFlatTerrain"
     meshes = {f"{part}.stl": tetrahedron() for part in ("trunk", "hip", "thigh", "thigh_mirror", "calf")}
-    own = base.get_assets
-    base.get_assets = lambda: own() | meshes
+    get_assets = base.get_assets
+    base.get_assets = lambda: get_assets() | meshes
     config = joystick.default_config()
     config.impl = "jax"
     env = joystick.Joystick(task="flat_terrain", config=config)
@@ -102,7 +101,7 @@ def playground(num_envs):
     factory = ppo.pop("network_factory")
     iteration = num_envs * ppo["unroll_length"]
     ppo |= {"num_envs": num_envs, "batch_size": num_envs // ppo["num_minibatches"]}
-    ppo |= {"num_timesteps": 6 * iteration, "num_evals": 7}  # evaluations, left out, end each iteration
+    ppo |= {"num_timesteps": 6 * iteration, "num_evals": 7}  # progress_fn is called at the end of each iteration
     ends = []
     train.train(
         env,

@@ -1,4 +1,4 @@
-"""Many devices, on one host or several: environments are split over all of them, all else is the same on each.
+"""Many devices, on one host or several. Environments are split over all of them, and each has a copy of the rest.
 
 The scripts read as for one device. The compiler adds the communication where these shardings ask for it: gradients and
 statistics are means over all environments, and minibatches are shuffled within each device's block of them.
@@ -12,33 +12,42 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from envs import records
+from experiment import records
 
 
 def join(distributed):
-    """With --distributed: one process of many, one a host; all but the first print nothing.
+    """Join the other processes with --distributed, one on each host. All but the first print nothing.
 
     SLURM and Open MPI tell a process who it is; elsewhere set JAX_COORDINATOR_ADDRESS (host:port of process 0),
-    JAX_NUM_PROCESSES and JAX_PROCESS_ID. UserError if nothing does.
+    JAX_NUM_PROCESSES and JAX_PROCESS_ID. UserError if nothing does, or if JAX finds no device.
     """
-    if not distributed:
-        return
-    count, own = (os.environ.get(f"JAX_{name}") for name in ("NUM_PROCESSES", "PROCESS_ID"))
-    try:
-        jax.distributed.initialize(num_processes=count and int(count), process_id=own and int(own))
-    except (ValueError, RuntimeError) as error:
-        raise records.UserError(f"--distributed: {error}; see envs/devices.py for what a process must know") from None
+    if distributed:
+        count, number = (os.environ.get(f"JAX_{name}") for name in ("NUM_PROCESSES", "PROCESS_ID"))
+        try:
+            jax.distributed.initialize(num_processes=count and int(count), process_id=number and int(number))
+        except (ValueError, RuntimeError) as error:
+            raise records.UserError(f"--distributed: {error}; see experiment/devices.py for what to set") from None
+    find()
     if not is_first():
         sys.stdout = open(os.devnull, "w")  # noqa: SIM115, for the rest of the process
 
 
+def find():
+    """Start JAX's devices. UserError if the platform that JAX_PLATFORMS names is not here."""
+    try:
+        jax.devices()
+    except (RuntimeError, AssertionError):
+        platform = os.environ.get("JAX_PLATFORMS", "")
+        raise records.UserError(f"JAX_PLATFORMS={platform}: no such device here; unset it, or set it to cpu") from None
+
+
 def is_first():
-    """Whether this process prints and writes files."""
+    """True in the process that prints and writes files."""
     return jax.process_index() == 0
 
 
 def check_engine(engine):
-    """ValueError if this engine cannot use the devices that are here."""
+    """Raise ValueError if this engine cannot use the present devices."""
     name = type(engine).__name__.removesuffix("Engine").lower()
     if jax.device_count() > 1 and not engine.many_devices:
         raise ValueError(f"engine {name} works on one device, here are {jax.device_count()}; choose --engine mjx")
@@ -52,7 +61,7 @@ def mesh():
 
 
 def same():
-    """Sharding of an array that every device has whole."""
+    """Sharding of an array of which every device has a copy."""
     return NamedSharding(mesh(), PartitionSpec())
 
 
@@ -67,7 +76,7 @@ def of_state(state, axis):
 
 
 def place(tree, shardings):
-    """Arrays that every process has alike, laid out over the devices by a tree of shardings."""
+    """Lay arrays, the same in every process, out over the devices by a tree of shardings."""
 
     def put(x, sharding):
         if jnp.issubdtype(x.dtype, jax.dtypes.prng_key):

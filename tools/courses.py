@@ -1,10 +1,11 @@
 """Picture of every parkour skill at levels 0, 4 and 9: the robot at the start, its height and ceiling scans as dots.
 
-    python results/courses.py
+    python tools/courses.py
 
 Writes results/courses.png.
 """
 
+import io
 import sys
 from pathlib import Path
 
@@ -18,18 +19,19 @@ sys.path.insert(0, str(ROOT))
 
 import envs
 from envs import parkour, render, terrain
+from experiment import records
 
 LEVELS = (0, 4, 9)
 
 
 def dots(spec, points, rgba):
-    """Small spheres at points (P, 3)."""
+    """Add small spheres at points (P, 3)."""
     for point in np.asarray(points, np.float64):
         spec.worldbody.add_site(pos=point, size=[0.015, 0.015, 0.015], rgba=rgba)
 
 
 def picture(env, level, key):
-    """The start of one episode of a level, with what the robot's noise-free scans see. Returns an Image."""
+    """Draw the start of one episode of a level with the robot's noise-free scans. Returns an Image."""
     state = env.reset(key, curriculum=env.at_level(level))
     motion, task = env.motion(state.physics), state.task.replace(shift=jnp.zeros(3))
     spec = render.build(env, state.physics)
@@ -39,8 +41,8 @@ def picture(env, level, key):
     if env.overhead.any():
         xy = env.grid(parkour.CEILING_GRID, motion, task)
         under = terrain.underside_heights(motion.mocap_pos[env.overhead], env.half[env.overhead], xy)
-        seen = np.asarray(under - motion.base_pos[2] < 1.0)
-        dots(spec, jnp.concatenate([xy, under[:, None]], -1)[seen], [0.1, 0.3, 0.9, 1])
+        near = np.asarray(under - motion.base_pos[2] < 1.0)
+        dots(spec, jnp.concatenate([xy, under[:, None]], -1)[near], [0.1, 0.3, 0.9, 1])
     return render.draw(spec, np.asarray(state.physics.qpos, np.float64)[None])[0]
 
 
@@ -53,7 +55,9 @@ def main():
             image = picture(env, level, jax.random.key(3))
             ImageDraw.Draw(image).text((6, 4), f"{task}, level {level}", fill=(20, 20, 20))
             sheet.paste(image, (column * render.WIDTH, row * render.HEIGHT))
-    sheet.save(ROOT / "results/courses.png", optimize=True)
+    file = io.BytesIO()
+    sheet.save(file, "PNG", optimize=True)
+    records.replace_bytes(ROOT / "results/courses.png", file.getvalue())
     print("wrote results/courses.png")
 
 

@@ -1,18 +1,18 @@
-"""Measure speed and memory on this machine: results/bench/<machine>.json, and README.md with the tables.
+"""Measure speed and memory on this machine, into results/bench/<machine>.json, and make README.md there from them.
 
-    python results/bench.py
-    python results/bench.py --parts engines --tasks go1_loco --engines mjx warp --counts 1024 4096 --machine h200
-    python results/bench.py --parts peers --peers .peers/bin/python
+    python tools/bench.py
+    python tools/bench.py --parts engines --tasks go1_loco --engines mjx warp --counts 1024 4096 --machine h200
+    python tools/bench.py --parts peers --peers .peers/bin/python
 
-engines   steps per second of the physics alone ("bare": random joint targets, as at the start of a training) and of the
-          whole environment step ("env": engine, rewards, observations, resets), compile time and memory
-training  ppo_finetune.py with a task's preset, learning included, after compilation: of 512 environments on a CPU, of
-          each number on an accelerator
-seeds     five seeds in one program against one seed
-solver    how far a limit on the contact solver's iterations moves a control step of an exploring robot
-peers     PPO of rsl_rl and Brax, and how many times faster ours is ("ours": at the same widths); see peers.py
+    engines   steps per second, compile time and memory: of the physics alone ("bare", with random joint targets), and
+              of the whole environment step ("env": engine, rewards, observations, resets)
+    training  ppo_finetune.py with a task's preset, learning included, after compilation; 512 environments on a CPU,
+              each of --counts on an accelerator
+    seeds     five seeds in one program against one seed
+    solver    error of one control step of an exploring robot when the contact solver's iterations are limited
+    peers     PPO of rsl_rl and Brax, and the speed of ours over theirs ("ours": at the same widths); see peers.py
 
-A part that is measured again replaces what stood there. Every figure comes from a process of its own.
+A part that is measured again replaces its older figures. Each figure comes from a process of its own.
 """
 
 import copy
@@ -33,7 +33,7 @@ from typing import Literal
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 
-# This process names the device while others measure on it: it must not take most of a GPU's memory.
+# This process keeps the device open while others measure on it, so it must not take most of a GPU's memory.
 os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
 
 import jax
@@ -42,6 +42,8 @@ import numpy as np
 import tyro
 
 import envs
+from envs.engine import cpu_count
+from experiment import records
 
 Part = Literal["engines", "training", "seeds", "solver", "peers"]
 
@@ -53,10 +55,10 @@ class Args:
     engines: tuple[Literal["c", "mjx", "warp"], ...] = ("c", "mjx")
     counts: tuple[int, ...] = (256, 1024, 4096)  # environments; mjx and warp on a CPU: 64
     hidden: tuple[int, ...] | None = None  # widths of the trained MLP; None: the task's
-    peers: str | None = None  # Python that has the peers' packages
-    machine: str = "cpu"  # name of the results
-    label: str = ""  # added to the parts' names, so that they stand beside what was measured before
-    limit_s: float = 400.0  # for one figure
+    peers: str | None = None  # Python of an environment that has the peers' packages
+    machine: str = "cpu"  # name of the results' file
+    label: str = ""  # added to the parts' names, so that older figures are kept
+    limit_s: float = 400.0  # for each figure
     cell: str | None = None  # internal: measure one figure and print it
 
 
@@ -73,7 +75,7 @@ def rate(function, carry, inputs, steps, repeats=3):
 
 
 def stepping(task, engine, num_envs, whole):
-    """Speed of the engine alone, or of the whole environment step; with compile time and peak memory."""
+    """Speed, compile time and peak memory of the engine alone, or of the whole environment step."""
     env = envs.make(task, engine)
     length = 50 if engine == "c" or jax.default_backend() != "cpu" else 10
     state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), num_envs))
@@ -89,7 +91,7 @@ def stepping(task, engine, num_envs, whole):
 
 
 def memory():
-    """Peak memory [MiB]: of the device where JAX knows it, else of this process."""
+    """Peak memory [MiB] of the device if JAX knows it, else of this process."""
     stats = jax.devices()[0].memory_stats() or {}
     kib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1024 if sys.platform == "darwin" else 1)
     return stats["peak_bytes_in_use"] / 2**20 if "peak_bytes_in_use" in stats else kib / 1024
@@ -119,12 +121,12 @@ def training(task, num_envs=None, hidden=None, num_seeds=1, extra=(), iterations
         return {"envs": num_envs, "steps/s": speed, "compile s": compile_s, "start to first row s": to_first}
 
 
-def in_process(limit_s, what, *inputs):
-    """One of the functions above in a process of its own, or a row that says why there is no figure.
+def in_process(limit_s, name, *inputs):
+    """Call a function of FIGURES in a process of its own. If that fails, the row holds the reason.
 
     jaxlib 0.10.2 can lock up on a CPU of two cores where two batched Cholesky factorisations meet (seen with G1, mjx).
     """
-    command = [sys.executable, __file__, "--cell", json.dumps([what, *inputs])]
+    command = [sys.executable, __file__, "--cell", json.dumps([name, *inputs])]
     try:
         run = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=limit_s, check=False)
     except subprocess.TimeoutExpired:
@@ -135,7 +137,7 @@ def in_process(limit_s, what, *inputs):
 
 
 def engine_rows(args):
-    """Each task on each engine with each number of environments, bare and whole."""
+    """Rows of each task, engine and number of environments, bare and whole."""
     for task, engine in itertools.product(args.tasks, args.engines):
         slow = engine != "c" and jax.default_backend() == "cpu"
         for count, what in itertools.product((64,) if slow else args.counts, ("bare", "env")):
@@ -144,7 +146,7 @@ def engine_rows(args):
 
 
 def training_rows(args):
-    """Engine c with 512 environments on a CPU; on an accelerator each engine with each number of environments."""
+    """Rows of each task: engine c with 512 environments on a CPU, else each engine and number of environments."""
     on_cpu = jax.default_backend() == "cpu"
     engines, counts = (("c",), (512,)) if on_cpu else (args.engines, args.counts)
     for task, engine, count in itertools.product(args.tasks, engines, counts):
@@ -153,20 +155,22 @@ def training_rows(args):
 
 
 def seed_rows(args):
+    """Rows of one and of five seeds."""
     for count in (1, 5):
         row = in_process(5 * args.limit_s, "training", "go1_loco", 256, None, count)
         yield {"task": "go1_loco", "seeds": count} | row
 
 
 def solver_rows(args):
+    """Rows of each task and limit."""
     for task, limit in itertools.product(args.tasks, (4, 6, 10)):
         yield {"task": task, "limit": limit} | in_process(args.limit_s, "solver", task, limit)
 
 
 def solver(task, limit, num_envs=64):
-    """One control step after 0.6 s of random actions, against the converged one.
+    """Error of one control step after 0.6 s of random actions, against a converged solver.
 
-    The error is of qpos [m, rad] and of 0.02 s times qvel, the largest of a robot, its 90th percentile over robots.
+    It is the 90th percentile over robots of a robot's largest error of qpos [m, rad] and of 0.02 s times qvel.
     """
     env = envs.make(task, "c")
     state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), num_envs))
@@ -174,10 +178,10 @@ def solver(task, limit, num_envs=64):
     actions = 0.6 * jax.random.normal(jax.random.key(1), (31, num_envs, env.action_dim))
     for action in actions[:-1]:
         state = step(state, action)
-    physics, ends, used = jax.device_get(state.physics), {}, []
-    for most in (limit, 100):
+    physics, results, used = jax.device_get(state.physics), {}, []
+    for iterations in (limit, 100):
         model = copy.copy(env.model)
-        model.opt.iterations = model.opt.ls_iterations = most
+        model.opt.iterations = model.opt.ls_iterations = iterations
         rows = []
         for i, target in enumerate(np.asarray(env.default_pose + env.robot.action_scale * actions[-1])):
             data = mujoco.MjData(model)
@@ -185,18 +189,18 @@ def solver(task, limit, num_envs=64):
             data.mocap_pos[:], data.mocap_quat[:] = physics.mocap_pos[i], physics.mocap_quat[i]
             for _ in range(env.config.decimation):
                 mujoco.mj_step(model, data)
-                used += [int(data.solver_niter[0])] if most == limit else []
+                used += [int(data.solver_niter[0])] if iterations == limit else []
             rows.append(np.concatenate([data.qpos, 0.02 * data.qvel]))
-        ends[most] = np.array(rows)
-    error = np.abs(ends[limit] - ends[100]).max(1)
+        results[iterations] = np.array(rows)
+    error = np.abs(results[limit] - results[100]).max(1)
     at_limit = float(np.mean(np.array(used) >= limit))
     return {"mean iterations": float(np.mean(used)), "at limit": at_limit, "error": float(np.quantile(error, 0.9))}
 
 
 def peer_rows(args):
-    """Ours beside rsl_rl on the same physics and networks, and beside Playground with Brax; 512 environments.
+    """Rows of ours, of rsl_rl on the same physics and networks, and of Playground with Brax; 512 environments.
 
-    Neither has a mirror loss, so ours stands there without it as well.
+    Neither of them has a mirror loss, so ours is also measured without.
     """
     for hidden in ((128, 128, 128), (512, 256, 128)):
         for what, extra in (("ours", ()), ("ours, no mirror loss", ("--mirror-coef", 0))):
@@ -208,13 +212,15 @@ def peer_rows(args):
 
 
 def run_peer(args, words):
-    command = [args.peers, "results/peers.py", *words]
+    """Run peers.py with these arguments. If it fails, the row holds the reason."""
+    command = [args.peers, "tools/peers.py", *words]
     run = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False, env=os.environ)
     if run.returncode:
         return {"failed": run.stderr.strip().splitlines()[-1][:120]}
     return {"envs": 512} | json.loads(run.stdout.splitlines()[-1])
 
 
+FIGURES = {"stepping": stepping, "training": training, "solver": solver}
 ROWS = {
     "engines": engine_rows,
     "training": training_rows,
@@ -225,18 +231,18 @@ ROWS = {
 
 
 def cpu_name():
-    """The processor's name, where the system tells it."""
+    """Name of the processor, if the system gives it."""
     info = Path("/proc/cpuinfo")
     names = [line.split(":")[1].strip() for line in info.read_text().splitlines() if "model name" in line]
     return names[0] if names else platform.processor() or platform.machine()
 
 
 def machine():
-    """What the figures were measured on."""
+    """Machine and versions that the figures were measured with."""
     git = subprocess.run(["git", "describe", "--always", "--dirty"], cwd=ROOT, capture_output=True, text=True)
     return {
         "cpu": cpu_name(),
-        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        "cores": cpu_count(),
         "device": jax.devices()[0].device_kind,
         "python": platform.python_version(),
         "jax": jax.__version__,
@@ -246,6 +252,7 @@ def machine():
 
 
 def as_text(value):
+    """A number, or numbers, as in the tables."""
     if isinstance(value, float):
         digits = 0 if abs(value) >= 100 else 2
         return f"{value:,.{digits}f}" if not 0 < abs(value) < 0.01 else f"{value:.1e}"
@@ -261,29 +268,27 @@ def table(rows):
 
 
 def with_ratios(rows):
-    """Rows of part peers, and how many times faster ours is: at the same widths, and at the first ones measured."""
+    """Rows of part peers with the speed of ours over theirs: at the same widths, and at the first ones measured."""
     ours = {tuple(row["hidden"]): row["steps/s"] for row in rows if row["what"] == "ours" and "steps/s" in row}
-    told = []
+    compared = []
     for row in rows:
         speed, same = row.get("steps/s"), ours.get(tuple(row["hidden"]))
-        known = speed and same
-        told.append(row | ({"ours": same / speed, "ours, small": next(iter(ours.values())) / speed} if known else {}))
-    return told
+        ratios = {"ours": same / speed, "ours, small": next(iter(ours.values())) / speed} if speed and same else {}
+        compared.append(row | ratios)
+    return compared
 
 
 def main(args):
     if args.cell:
-        what, *inputs = json.loads(args.cell)
-        print(json.dumps({"stepping": stepping, "training": training, "solver": solver}[what](*inputs)))
-        return
+        name, *inputs = json.loads(args.cell)
+        return print(json.dumps(FIGURES[name](*inputs)))
     for name in {*args.tasks} - envs.TASKS.keys():
-        print(f"error: unknown task {name!r}; known: {', '.join(envs.TASKS)}", file=sys.stderr)
-        sys.exit(2)
+        raise records.UserError(f"unknown task {name!r}; known: {', '.join(envs.TASKS)}")
     if "peers" in args.parts and not (args.peers and Path(args.peers).exists()):
-        print("error: part peers needs --peers PYTHON, of an environment as results/peers.py says", file=sys.stderr)
-        sys.exit(2)
-    out = ROOT / "results/bench"
-    path = out / f"{args.machine}.json"
+        raise records.UserError("part peers needs --peers PYTHON, of an environment as in tools/peers.py")
+    folder = ROOT / "results/bench"
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / f"{args.machine}.json"
     known = json.loads(path.read_text()) if path.exists() else {}
     for part in args.parts:
         here, rows = machine(), []
@@ -294,21 +299,21 @@ def main(args):
         if part == "peers":
             print(table(with_ratios(rows)))
         known[f"{part} {args.label}".strip()] = {"machine": here, "rows": rows}
-        out.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps(known, indent=1) + "\n")
-    write_page(out)
+        records.replace_text(path, json.dumps(known, indent=1) + "\n")
+    return write_page(folder)
 
 
-def write_page(out):
-    """README.md: the tables of every machine."""
-    page = ["# Speed", "", "Made by `python results/bench.py`; what the rows mean stands in [bench.py](../bench.py)."]
-    for path in sorted(out.glob("*.json")):
+def write_page(folder):
+    """Write README.md: the tables of every machine."""
+    page = ["# Speed", "", "Made by [`python tools/bench.py`](../../tools/bench.py), which explains the rows."]
+    for path in sorted(folder.glob("*.json")):
         for part, found in json.loads(path.read_text()).items():
             facts = ", ".join(f"{name} {value}" for name, value in found["machine"].items())
             rows = with_ratios(found["rows"]) if part.startswith("peers") else found["rows"]
             page += ["", f"## {path.stem}: {part}", "", f"{facts}.", "", table(rows)]
-    (out / "README.md").write_text("\n".join(page) + "\n")
+    records.replace_text(folder / "README.md", "\n".join(page) + "\n")
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args, description=__doc__))
+    with records.one_line_errors():
+        main(tyro.cli(Args, description=__doc__))

@@ -1,11 +1,11 @@
-"""Drive a robot in plain MuJoCo with an exported policy: no JAX, as on the robot's own computer.
+"""Drive a robot in plain MuJoCo with an exported policy: without JAX, as on the robot's own computer.
 
-    python ppo_finetune.py --task go1_loco --eval results/tasks/go1_loco/policy.msgpack --export go1.onnx
-    python results/play_onnx.py go1.onnx --command 0.8 0 0 --seconds 10
-    python results/play_onnx.py go1.onnx --viewer
+    python play.py results/tasks/go1_loco/policy.msgpack --export go1.onnx
+    python tools/play_onnx.py go1.onnx --command 0.8 0 0 --seconds 10
+    python tools/play_onnx.py go1.onnx --viewer
 
-With --viewer a window opens in which the arrow keys change the forward velocity and the turning rate, 7 and 9 the
-sideways velocity, and the space bar stops. Needs requirements-export.txt; works for the locomotion tasks.
+It works for the locomotion tasks and needs requirements-export.txt. In the window of --viewer, arrow keys change the
+forward velocity and the turning rate, 7 and 9 the sideways velocity, and the space bar stops.
 """
 
 import json
@@ -22,8 +22,8 @@ ROOT = Path(__file__).resolve().parent.parent
 LIMIT = np.ones(3)  # of the command: m/s, m/s, rad/s
 
 
-# >>> copy: keys (owner: results/play_onnx.py)
-KEYS = {  # GLFW key codes, none of which the window uses itself -> which number of the command changes, and its sign
+# >>> copy: keys (owner: tools/play_onnx.py)
+KEYS = {  # GLFW key codes, none of which the window uses itself -> index of a number of the command, and its sign
     265: (0, 1),  # up
     264: (0, -1),  # down
     ord("7"): (1, 1),
@@ -34,7 +34,7 @@ KEYS = {  # GLFW key codes, none of which the window uses itself -> which number
 
 
 def pressed(key, command, low, high):
-    """The command (3,) after a key: a twentieth of its range further, or 0 (as near as it goes) for the space bar."""
+    """The command (3,) after a key: a twentieth of its range further; for the space bar 0, or the nearest in range."""
     change = np.zeros(len(command))
     if key in KEYS:
         index, side = KEYS[key]
@@ -47,14 +47,14 @@ def pressed(key, command, low, high):
 
 @dataclass(frozen=True)
 class Args:
-    policy: tyro.conf.Positional[str]  # an ONNX file of ppo_finetune.py --export
+    policy: tyro.conf.Positional[str]  # ONNX file of play.py --export
     command: tuple[float, float, float] = (0.5, 0.0, 0.0)  # forward, sideways [m/s], turning [rad/s]
-    seconds: float = 20.0
+    seconds: float = 20.0  # without --viewer
     viewer: bool = False  # watch and steer in a window
 
 
 class Player:
-    """One robot on a plane, its policy, and the history the policy wants back."""
+    """One robot on a plane, its policy, and the history that the policy takes and returns."""
 
     def __init__(self, path):
         import onnxruntime
@@ -74,7 +74,7 @@ class Player:
         self.stand()
 
     def stand(self):
-        """The default pose, feet on the ground."""
+        """Put the robot into its default pose, feet on the ground."""
         m, d = self.model, self.data
         mujoco.mj_resetData(m, d)
         d.qpos[:7], d.qpos[7:] = (0, 0, 1, 1, 0, 0, 0), self.pose
@@ -85,7 +85,7 @@ class Player:
         self.history = None
 
     def readings(self, command):
-        """What the policy reads, in SI units and the base frame."""
+        """Inputs of the policy by name, in SI units and the base frame."""
         d, turn = self.data, np.zeros(9)
         mujoco.mju_quat2Mat(turn, d.qpos[3:7])
         down = turn.reshape(3, 3).T
@@ -99,7 +99,7 @@ class Player:
         }
 
     def step(self, command):
-        """One control step; returns the action (A,)."""
+        """Make one control step. Returns the action (A,)."""
         read = self.readings(command)
         if self.history is None:
             x = np.concatenate([(read | {"joint_pos": read["joint_pos"] - self.pose})[n] for n in self.facts["prop"]])
@@ -115,11 +115,12 @@ class Player:
         return action
 
     def fallen(self):
+        """True if the trunk is tilted by more than 60 degrees."""
         return self.readings((0, 0, 0))["gravity"][2] > -0.5
 
 
 def watch(player, command):
-    """A window, until it is closed."""
+    """Show the robot in a window and take its command from the keys, until it is closed."""
     import mujoco.viewer
 
     wanted = np.array(command, float)
@@ -138,20 +139,20 @@ def watch(player, command):
 
 
 def walk(player, command, seconds):
-    """Follow one command; returns the mean velocity in the base frame (forward, sideways, turning), and falls."""
-    seen, falls = [], 0
+    """Follow one command. Returns the mean velocity (forward, sideways, turning) in the base frame, and falls."""
+    velocities, falls = [], 0
     for _ in range(round(seconds / player.facts["dt"])):
         player.step(command)
         read = player.readings(command)
-        seen.append([*read["lin_vel"][:2], read["ang_vel"][2]])
+        velocities.append([*read["lin_vel"][:2], read["ang_vel"][2]])
         if player.fallen():
             falls += 1
             player.stand()
-    return np.mean(seen[len(seen) // 4 :], axis=0), falls
+    return np.mean(velocities[len(velocities) // 4 :], axis=0), falls
 
 
 def fail(text):
-    """One line, exit code 2."""
+    """Print one line and exit with code 2."""
     print(f"error: {text}", file=sys.stderr)
     sys.exit(2)
 
@@ -161,11 +162,11 @@ def main(args):
         player = Player(args.policy)
     except ImportError:
         fail("onnxruntime is missing: pip install -r requirements-export.txt")
-    except Exception:  # onnxruntime has an error class for each way in which a file can be bad
-        fail(f"{args.policy} is not a policy; write one with ppo_finetune.py --eval POLICY --export FILE")
+    except Exception:  # onnxruntime has no common error class
+        fail(f"{args.policy} is not a policy; write one with play.py POLICY --export FILE")
     unknown = player.shapes.keys() - player.readings(args.command).keys() - {"prop_history", "action_history"}
     if unknown:
-        fail(f"{args.policy} reads {', '.join(sorted(unknown))}, which only our environments can give")
+        fail(f"{args.policy} reads {', '.join(sorted(unknown))}, which only the environments of this project provide")
     if args.viewer:
         return watch(player, args.command)
     velocity, falls = walk(player, args.command, args.seconds)

@@ -1,0 +1,118 @@
+"""Find where a training broke: continue from its last good state, and dump the robots that failed to nan.npz.
+
+    python tools/replay.py runs/go1_loco/mlp/seed0
+    python tools/replay.py runs/go1_loco/mlp/seed0/nan.npz
+
+The first command repeats the training, bit for bit on engine c, up to the first rollout with a number that is not
+finite or a simulation that diverged. nan.npz holds these environments up to that step: qpos, qvel (steps, environments,
+...) before each control step, the joint targets `ctrl`, and the environments' numbers. If no robot failed, it was the
+update of the weights. The second command steps the dumped robots in plain MuJoCo.
+"""
+
+import io
+import sys
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import optax
+import tyro
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(ROOT))
+
+import envs
+import ppo_finetune
+from experiment import records
+from experiment.run import make_env
+
+
+@dataclass(frozen=True)
+class Args:
+    path: tyro.conf.Positional[str]  # a run's folder, or its nan.npz
+    iterations: int = 10  # of the training to repeat, at most
+    robots: int = 8  # in the dump, at most
+
+
+def trace(args, env, net, state):
+    """One rollout: qpos and qvel before each step, joint targets, and where a step failed; each (T, N, ...)."""
+    k_roll, _ = jax.random.split(jax.random.fold_in(state.key, state.iteration))
+    _, roll, _ = ppo_finetune.rollout(args, env, net, state.params, state.env, k_roll)
+
+    def step(before, action):
+        after = jax.vmap(env.step)(before, action)
+        sound = jnp.isfinite(after.reward) & jnp.isfinite(action).all(-1) & jnp.isfinite(after.final_obs).all(-1)
+        physics, target = before.physics, env.default_pose + env.robot.action_scale * action
+        return after, (physics.qpos, physics.qvel, target, ~sound | after.metrics["diverged"])
+
+    return jax.lax.scan(step, state.env, roll.action)[1]
+
+
+def find(folder, iterations, robots):
+    """Write nan.npz and print what failed. UserError if the folder is no run that can be resumed."""
+    args = records.resumed(ppo_finetune.Args(resume=str(folder)))
+    env = make_env(envs.make, args.task, args)
+    args = ppo_finetune.merge(args, env.config.ppo)
+    net, opt = ppo_finetune.make_net(args, env), optax.scale_by_adam()
+    like = jax.eval_shape(partial(ppo_finetune.init_state, args, env, net, opt))
+    state, _ = records.load_state(folder, like)
+    state = jax.tree.map(jnp.asarray, state)
+    jitted_trace = jax.jit(partial(trace, args, env, net))
+    advance = jax.jit(lambda state: ppo_finetune.iteration(args, env, net, opt, state)[0])
+    first = int(state.iteration)
+    for _ in range(iterations):
+        now = int(state.iteration)
+        qpos, qvel, ctrl, failed = map(np.asarray, jitted_trace(state))
+        if failed.any():
+            last = int(np.argmax(failed.any(1)))
+            chosen = np.flatnonzero(failed[last])[:robots]
+            dump = {name: x[: last + 1, chosen] for name, x in (("qpos", qpos), ("qvel", qvel), ("ctrl", ctrl))}
+            path, file = Path(folder) / "nan.npz", io.BytesIO()
+            np.savez(file, **dump, environment=chosen, task=args.task, set=np.array(args.set, str), iteration=now)
+            records.replace_bytes(path, file.getvalue())
+            count = f"{failed[last].sum()} of {args.num_envs}"
+            return print(f"iteration {now}, step {last}: {count} environments failed; wrote {path}")
+        state = advance(state)
+        if not records.finite(state.params):
+            return print(f"iteration {now}: no robot failed, but the update made weights that are not finite")
+    return print(f"nothing failed from iteration {first} to {state.iteration - 1}; see --iterations")
+
+
+def repeat(path):
+    """Repeat the last step of each dumped robot in plain MuJoCo."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            dump = {name: file[name] for name in ("qpos", "qvel", "ctrl", "environment", "task", "set")}
+        args = ppo_finetune.Args(task=str(dump["task"]), engine="c", set=tuple(dump["set"].tolist()))
+        env = make_env(envs.make, args.task, args)
+        if dump["qpos"].shape[2:] != (env.model.nq,) or dump["ctrl"].shape[2:] != (env.model.nu,):
+            raise ValueError("its shapes are not those of its task")
+    except Exception as error:  # numpy has no common class for what can be wrong with a file
+        raise records.UserError(f"{path} is not a dump of tools/replay.py: {error}") from None
+    for i, number in enumerate(dump["environment"]):
+        data = mujoco.MjData(env.model)
+        data.qpos[:], data.qvel[:], data.ctrl[:] = (dump[name][-1, i] for name in ("qpos", "qvel", "ctrl"))
+        print(
+            f"environment {number}: base at {np.round(data.qpos[:3], 2)} m, joint targets {np.round(data.ctrl, 2)} rad"
+        )
+        for step in range(env.config.decimation):
+            mujoco.mj_step(env.model, data)
+            speed, force = np.abs(data.qvel).max(), np.abs(data.qfrc_constraint).max()
+            print(
+                f"  physics step {step}: fastest {speed:.3g} m/s or rad/s, largest contact force {force:.3g} N or N m"
+            )
+
+
+def main(args):
+    if Path(args.path).suffix == ".npz":
+        return repeat(Path(args.path))
+    return find(Path(args.path), args.iterations, args.robots)
+
+
+if __name__ == "__main__":
+    with records.one_line_errors():
+        main(tyro.cli(Args, description=__doc__))
