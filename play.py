@@ -102,8 +102,8 @@ def run_evaluation(args):
     """Print and save metrics of the task on its usual commands and of the showcase; write pictures of the showcase."""
     from envs import render  # matplotlib and OpenGL are slow to load
 
-    if args.episodes < 1:
-        raise records.UserError(f"--episodes must be at least 1, not {args.episodes}")
+    if not 1 <= args.episodes <= 100_000:
+        raise records.UserError(f"--episodes must be from 1 to 100000, not {args.episodes}")
     env, net, params, meta = load(args)
     levels = range(env.LEVELS) if args.level is None else [args.level]
     run = jax.jit(lambda params, level: evaluate(env, net, params, args.episodes, level)[0])
@@ -119,8 +119,9 @@ def run_evaluation(args):
     report = jax.tree.map(float, report | {"showcase": shown}) | {"showcase_config": fields}
     folder = Path(args.policy).parent
     records.replace_text(folder / "eval.json", json.dumps(report, indent=1) + "\n")
-    for picture in render.film(show, qpos, start, folder, **show.FILM_WINDOW):
-        print(f"wrote {picture}")
+    for name, picture in render.film(show, qpos, start, **show.FILM_WINDOW).items():
+        records.replace_bytes(folder / name, picture)
+        print(f"wrote {folder / name}")
 
 
 # --- Films, viewers ---
@@ -135,7 +136,7 @@ def film(args):
     try:
         render.check_video(path)
         _, start, qpos = jax.jit(lambda params: evaluate(env, net, params, 1))(params)
-        render.video(env, qpos, start, path)
+        records.write(path, render.video(env, qpos, start, path))
     except ValueError as error:
         raise records.UserError(str(error)) from None
     print(f"wrote {path}")
@@ -187,8 +188,7 @@ def onboard(env, net, params):
 def export_onnx(args):
     """Write the policy's mean action as an ONNX graph for one robot, batch 1, with the inputs and outputs of `onboard`.
 
-    Metadata, each as JSON: task, robot, joints, default_pose, action_scale, dt, history, prop and versions. Needs
-    requirements-export.txt.
+    Metadata, each as JSON: see `facts` below. Every list follows the order of `joints`. Needs requirements-export.txt.
     """
     try:
         import jax2onnx
@@ -207,19 +207,20 @@ def export_onnx(args):
     facts = {
         "task": meta["task"],
         "robot": env.robot.name,
+        "dt": env.dt,  # [s] control step
         "joints": list(env.robot.joints),
-        "default_pose": np.asarray(env.default_pose).tolist(),
-        "action_scale": env.robot.action_scale,
-        "dt": env.dt,
+        "default_pose": np.asarray(env.default_pose).tolist(),  # [rad]
+        "action_scale": [env.robot.action_scale] * env.action_dim,  # [rad] a unit of action
+        "kp": env.model.actuator_gainprm[:, 0].tolist(),  # [N m / rad]
+        "kd": env.model.dof_damping[6:].tolist(),  # [N m s / rad]; the MJCF has it as damping of the joints
+        "torque_limit": env.model.actuator_forcerange[:, 1].tolist(),  # [N m] of the kp part
         "history": env.config.history,
         "prop": list(env.prop_layout),
         "versions": records.versions(),
     }
     onnx.helper.set_model_props(model, {name: json.dumps(value) for name, value in facts.items()})
-    path = Path(args.export)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    records.replace_bytes(path, model.SerializeToString())
-    print(f"wrote {path}")
+    records.write(Path(args.export), model.SerializeToString())
+    print(f"wrote {args.export}")
 
 
 # --- Main ---

@@ -178,7 +178,7 @@ class ActorCritic(nn.Module):
     def setup(self):
         self.actor = MLP((*self.hidden, self.action_dim), 0.01, self.weight_init)  # the first actions are ~0
         self.critic = MLP((*self.hidden, 1), 0.05, self.weight_init)
-        # Deviation: rsl_rl learns the std itself, we its log.
+        # Deviation (log std): rsl_rl learns the std itself.
         self.log_std = self.param("log_std", nn.initializers.constant(jnp.log(self.init_std)), (self.action_dim,))
 
     @staticmethod

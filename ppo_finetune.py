@@ -5,7 +5,7 @@
 
 Evaluate, film, steer or export the trained policy with play.py.
 Reads top to bottom: arguments, networks, warm start, rollout, losses, update, training.
-The algorithm follows rsl_rl, which the paper used; differences are marked `# Deviation:`.
+The algorithm follows rsl_rl, a fork of which the paper used. Differences are marked `# Deviation (name):`.
 Shapes in comments: T rollout steps, N environments, B minibatch, O observation, X proprioception x_t, A action,
 K history, S seeds.
 """
@@ -39,7 +39,7 @@ class Args:
     network: Literal["mlp", "pidm"] | None = None  # of actor and critic; None: pidm with --pretrained, else mlp
     pretrained: str | None = None  # PIDM checkpoint written by pretrain_pidm.py
     load_into: Literal["both", "actor", "critic", "history_encoder", "shuffled"] = "both"  # see `warm_start`
-    # Deviation: rsl_rl has PyTorch's; with orthogonal weights both quadrupeds learn faster.
+    # Deviation (weight init): rsl_rl has PyTorch's; with orthogonal weights both quadrupeds learn faster.
     weight_init: Literal["orthogonal", "pytorch"] = "orthogonal"  # of all layers that are not loaded
     preset: Literal["smoke", "cpu", "gpu"] = "cpu"  # scale: 4, 256 or 4096 environments
     seed: int = 0  # the only source of randomness
@@ -191,7 +191,7 @@ class ActorCritic(nn.Module):
     def setup(self):
         self.actor = MLP((*self.hidden, self.action_dim), 0.01, self.weight_init)  # the first actions are ~0
         self.critic = MLP((*self.hidden, 1), 0.05, self.weight_init)
-        # Deviation: rsl_rl learns the std itself, we its log.
+        # Deviation (log std): rsl_rl learns the std itself.
         self.log_std = self.param("log_std", nn.initializers.constant(jnp.log(self.init_std)), (self.action_dim,))
 
     @staticmethod
@@ -342,7 +342,7 @@ def rollout(args, env, net, params, env_state, key):
         env_state = jax.vmap(env.step)(env_state, action)
         done = env_state.terminated | env_state.truncated
 
-        # Deviation: rsl_rl bootstraps time-outs with V of the observation before the step, which is not the last one.
+        # Deviation (time limits): rsl_rl bootstraps with V of the observation before the step, which is not the last.
         final_inputs = net.inputs(env_state.final_obs, env_state.final_history)
         final_value = net.apply(params, final_inputs, method=net.value)
         bootstrap = args.gamma * final_value * (env_state.truncated if env.bootstrap_time_outs else 0.0)

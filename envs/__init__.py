@@ -6,7 +6,16 @@ from envs import gl, locomotion, parkour, pedipulation  # noqa: F401, gl comes b
 from envs.config import replace_checked
 from envs.explore import EXPLORE, Explore
 
-jax.config.update("jax_enable_x64", False)  # physics and networks are in single precision
+JAX_SETTINGS = {  # whatever JAX's variables of these names say: other values end in errors, or in other numbers
+    "jax_enable_x64": False,
+    "jax_disable_jit": False,
+    "jax_numpy_dtype_promotion": "standard",
+    "jax_numpy_rank_promotion": "allow",
+    "jax_default_prng_impl": "threefry2x32",
+    "jax_threefry_partitionable": True,
+}
+for setting, value in JAX_SETTINGS.items():
+    jax.config.update(setting, value)
 
 TASKS = {
     "anymal_loco": (locomotion.AnymalLocomotion, locomotion.ANYMAL_LOCO),

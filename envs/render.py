@@ -4,6 +4,7 @@ MuJoCo fixes its OpenGL when it is imported, and a broken driver can end the pro
 a second process, which draws the frames, and tries one OpenGL after the other.
 """
 
+import io
 import os
 import shutil
 import subprocess
@@ -19,8 +20,8 @@ WIDTH, HEIGHT = 320, 240  # [pixels] of one frame
 EVERY = 2  # control steps between frames of a moving picture
 
 
-def film(env, qpos, course, folder, start=4.0, strip_seconds=0.6, strip_frames=10, gif_seconds=4.0):
-    """Write rollout.png, a strip of frames, and rollout.gif of qpos (steps, nq) on a course. Returns the two paths.
+def film(env, qpos, course, start=4.0, strip_seconds=0.6, strip_frames=10, gif_seconds=4.0):
+    """Draw qpos (steps, nq) on a course: rollout.png, a strip of frames, and rollout.gif. Returns name -> bytes.
 
     Both start after `start` seconds, when the robot has found its pace, or earlier if the rollout is short. By default
     the strip has a frame every 0.06 s, so a stride of 0.3 to 0.45 s appears in five to seven phases.
@@ -38,16 +39,17 @@ def film(env, qpos, course, folder, start=4.0, strip_seconds=0.6, strip_frames=1
         frame = images[i].copy()
         ImageDraw.Draw(frame).text((6, 4), f"{i * env.dt:.2f} s", fill=(40, 40, 40))
         sheet.paste(frame, (place_in_sheet % 5 * WIDTH, place_in_sheet // 5 * HEIGHT))
-    png, gif = folder / "rollout.png", folder / "rollout.gif"
-    sheet.save(png, optimize=True)
-    save_gif([images[i] for i in moving], env.dt, gif)
-    return png, gif
+    png = io.BytesIO()
+    sheet.save(png, "PNG", optimize=True)
+    return {"rollout.png": png.getvalue(), "rollout.gif": gif_bytes([images[i] for i in moving], env.dt)}
 
 
-def save_gif(images, dt, path):
-    """Write images, EVERY control steps apart, as an endless GIF."""
-    frames = [image.quantize(64) for image in images]
-    frames[0].save(path, save_all=True, append_images=frames[1:], duration=round(1000 * EVERY * dt), loop=0)
+def gif_bytes(images, dt):
+    """Images, EVERY control steps apart, as an endless GIF."""
+    frames, gif = [image.quantize(64) for image in images], io.BytesIO()
+    duration = round(1000 * EVERY * dt)  # [ms]
+    frames[0].save(gif, "GIF", save_all=True, append_images=frames[1:], duration=duration, loop=0)
+    return gif.getvalue()
 
 
 def check_video(path):
@@ -59,21 +61,21 @@ def check_video(path):
 
 
 def video(env, qpos, course, path):
-    """Write a rollout qpos (steps, nq) on a course as a GIF or MP4, after the end of its name; see check_video."""
-    path.parent.mkdir(parents=True, exist_ok=True)
+    """Film a rollout qpos (steps, nq) on a course. Returns the bytes of a GIF or MP4, after the end of `path`."""
     size = (WIDTH, HEIGHT) if path.suffix == ".gif" else (2 * WIDTH, 2 * HEIGHT)  # a GIF grows large
     images = draw(build(env, course), np.asarray(qpos[::EVERY], np.float64), size)
     if path.suffix == ".gif":
-        save_gif(images, env.dt, path)
-        return
+        return gif_bytes(images, env.dt)
     width, height = images[0].size
     command = ["ffmpeg", "-y", "-loglevel", "error", "-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}"]
-    command += ["-r", f"{1 / (EVERY * env.dt):g}", "-i", "-", "-pix_fmt", "yuv420p", str(path)]
-    with subprocess.Popen(command, stdin=subprocess.PIPE) as encoder:
-        for image in images:
-            encoder.stdin.write(image.tobytes())
-    if encoder.returncode:
-        raise ValueError(f"ffmpeg could not write {path}")
+    command += ["-r", f"{1 / (EVERY * env.dt):g}", "-i", "-", "-pix_fmt", "yuv420p"]
+    with tempfile.TemporaryDirectory() as folder:
+        mp4 = Path(folder, "film.mp4")
+        frames = b"".join(image.tobytes() for image in images)
+        encoder = subprocess.run([*command, str(mp4)], input=frames, capture_output=True, text=False, check=False)
+        if encoder.returncode:
+            raise ValueError(f"ffmpeg could not make {path}: {encoder.stderr.decode().strip().splitlines()[-1]}")
+        return mp4.read_bytes()
 
 
 def build(env, course):
@@ -100,6 +102,7 @@ def draw(spec, qpos, size=(WIDTH, HEIGHT)):
             if done.returncode == 0:
                 if gl.ASKED and name != gl.ASKED:
                     print(f"MUJOCO_GL={gl.ASKED} does not work here: drew with {name}")
+                gl.ASKED = name  # the next picture needs no search
                 return [Image.fromarray(frame) for frame in np.load(Path(folder, "frames.npy"))]
     tried = ", ".join(names)
     print(f"no OpenGL here (tried {tried}): drawing stick figures; Debian's libosmesa6 gives real pictures")

@@ -37,6 +37,7 @@ def create_arrays(folder, args, env, iterations):
     try:
         arrays = {}
         for name, shape in shapes.items():
+            (folder / f"{name}.npy").unlink(missing_ok=True)  # who reads the old file keeps it as it is
             arrays[name] = np.lib.format.open_memmap(folder / f"{name}.npy", "w+", KINDS[name][0], shape)
             if hasattr(os, "posix_fallocate"):  # writing to a mapped file on a full disk is fatal; macOS cannot reserve
                 with (folder / f"{name}.npy").open("r+b") as file:

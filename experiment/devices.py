@@ -26,7 +26,9 @@ def join(distributed):
         try:
             jax.distributed.initialize(num_processes=count and int(count), process_id=number and int(number))
         except (ValueError, RuntimeError) as error:
-            raise records.UserError(f"--distributed: {error}; see experiment/devices.py for what to set") from None
+            raise records.UserError(
+                f"--distributed: {str(error).rstrip('.')}; see experiment/devices.py for what to set"
+            ) from None
     find()
     if not is_first():
         sys.stdout = open(os.devnull, "w")  # noqa: SIM115, for the rest of the process
@@ -36,9 +38,15 @@ def find():
     """Start JAX's devices. UserError if the platform that JAX_PLATFORMS names is not here."""
     try:
         jax.devices()
-    except (RuntimeError, AssertionError):
-        platform = os.environ.get("JAX_PLATFORMS", "")
-        raise records.UserError(f"JAX_PLATFORMS={platform}: no such device here; unset it, or set it to cpu") from None
+    except (RuntimeError, AssertionError) as error:
+        platform = os.environ.get("JAX_PLATFORMS")
+        if not platform:
+            raise records.UserError(f"JAX finds no device: {str(error).splitlines()[0]}") from None
+        jax.config.update("jax_platforms", None)
+        here = jax.devices()[0].platform
+        raise records.UserError(
+            f"JAX_PLATFORMS={platform}: no such device here; unset it, or set it to {here}"
+        ) from None
 
 
 def is_first():

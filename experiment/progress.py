@@ -22,7 +22,7 @@ class Progress:
 
     def __enter__(self):
         self.handlers = {sign: signal.signal(sign, self.stop) for sign in (signal.SIGINT, signal.SIGTERM)}
-        if sys.stdout.isatty():
+        if sys.stdout and sys.stdout.isatty():
             from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
             columns = BarColumn(bar_width=20), TextColumn("{task.percentage:.0f}%"), TimeRemainingColumn()

@@ -7,6 +7,7 @@ import contextlib
 import csv
 import dataclasses
 import functools
+import importlib.metadata
 import io
 import json
 import os
@@ -19,7 +20,6 @@ from pathlib import Path
 import flax
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 
 from envs.config import fits
@@ -41,23 +41,35 @@ class UserError(Exception):
 def one_line_errors():
     """Errors of user or machine print one line and exit with code 2. An early Ctrl-C or SIGTERM exits with code 1."""
     previous = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    for stream in (sys.stdout, sys.stderr):
+        if hasattr(stream, "reconfigure"):  # a terminal may lack the letters of a path
+            stream.reconfigure(errors="backslashreplace")
     try:
         yield
-    except UserError as error:
-        fail(error)
-    except OSError as error:
-        fail(f"{error.filename or 'a file'}: {error.strerror or error}")
-    except jax.errors.JaxRuntimeError as error:
-        if "RESOURCE_EXHAUSTED" not in str(error):
-            raise
-        what = str(error).splitlines()[0][:120]
-        fail(f"out of memory; lower --num-envs or --num-seeds, in stage 2 --batch ({what})")
+    except (UserError, OSError, MemoryError, jax.errors.JaxRuntimeError) as error:
+        if isinstance(error, BrokenPipeError):  # who read the output, as in `| head`, is gone
+            sys.stdout = open(os.devnull, "w")  # noqa: SIM115, for the rest of the process
+            sys.exit(1)
+        fail(in_one_line(error))
     except KeyboardInterrupt:
         sys.exit("interrupted")
     finally:
         signal.signal(signal.SIGTERM, previous)
         while CLAIMS:
-            CLAIMS.pop().close()
+            os.close(CLAIMS.popitem()[1])
+
+
+def in_one_line(error):
+    """A message for an error of user or machine; any other is raised again."""
+    if isinstance(error, UserError):
+        return str(error)
+    if isinstance(error, OSError):
+        nameless = "the working directory" if isinstance(error, FileNotFoundError) else "the system"  # of os.getcwd
+        return f"{error.filename or nameless}: {error.strerror or error}"
+    if isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in str(error):
+        what = str(error).split("\n")[0][:120]
+        return f"out of memory; lower --num-envs or --num-seeds, in stage 2 --batch ({what})"
+    raise error
 
 
 def fail(text):
@@ -66,23 +78,23 @@ def fail(text):
     sys.exit(2)
 
 
-CLAIMS = []  # open files, whose locks keep other processes out of this one's run folders
+CLAIMS = {}  # run folder -> descriptor, whose lock keeps other processes out
 
 
 def claim(folder):
     """Keep other processes from writing a run folder until this one is done. UserError if another one is at it."""
-    path = Path(folder) / "args.json"
-    if fcntl is None or not path.exists():
+    path = Path(folder).resolve()
+    if fcntl is None or path in CLAIMS or not path.is_dir():
         return
-    file = path.open()
+    file = os.open(path, os.O_RDONLY)
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
-        file.close()
+        os.close(file)
         raise UserError(f"another process is writing {folder}; wait for it, or choose another --run-dir") from None
     except OSError:  # a file system without locks
         pass
-    CLAIMS.append(file)
+    CLAIMS[path] = file
 
 
 @functools.cache
@@ -94,7 +106,7 @@ def versions():
         "machine": f"{platform.machine()}, {cpu_count()} CPUs",
         "python": platform.python_version(),
         "jax": jax.__version__,
-        "mujoco": mujoco.__version__,
+        "mujoco": importlib.metadata.version("mujoco"),
     }
 
 
@@ -103,8 +115,8 @@ def commit():
 
     def git(*words):
         clean = {name: value for name, value in os.environ.items() if not name.startswith("GIT_")}
-        run = subprocess.run(["git", *words], cwd=ROOT, env=clean, capture_output=True, text=True, check=True)
-        return run.stdout.strip()
+        run = subprocess.run(["git", *words], cwd=ROOT, env=clean, capture_output=True, check=True)
+        return os.fsdecode(run.stdout).strip()
 
     try:
         inside = Path(git("rev-parse", "--show-toplevel")).resolve() == ROOT  # not a copy within another checkout
@@ -118,6 +130,8 @@ def replace_bytes(path, blob):
 
     UserError if it cannot be written; the old one stays.
     """
+    if path.exists() and not path.is_file():  # /dev/null would become a file
+        raise UserError(f"cannot write {path}: it is {'a folder' if path.is_dir() else 'not a file'}")
     tmp = path.with_name(path.name + ".tmp")
     try:
         with tmp.open("wb") as file:
@@ -126,8 +140,19 @@ def replace_bytes(path, blob):
             os.fsync(file.fileno())
         tmp.replace(path)
     except OSError as error:
-        tmp.unlink(missing_ok=True)
-        raise UserError(f"cannot write {path}: {error.strerror}; the files of the last row are untouched") from None
+        with contextlib.suppress(OSError):
+            tmp.unlink()
+        before = "; what it held before is untouched" if path.exists() else ""
+        raise UserError(f"cannot write {path}: {error.strerror}{before}") from None
+
+
+def write(path, blob):
+    """`replace_bytes` where the folder may be missing."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f"cannot write {path}: {error.strerror}") from None
+    replace_bytes(path, blob)
 
 
 def replace_text(path, text):
@@ -179,12 +204,12 @@ def start_runs(each, config):
         record = dataclasses.asdict(args) | {"config": dataclasses.asdict(config), "versions": versions()}
         try:
             folder.mkdir(parents=True, exist_ok=True)
+            claim(folder)
             for old in (*(folder / name for name in (STATE, *RESULTS)), *folder.glob("events.out.tfevents.*")):
                 old.unlink(missing_ok=True)
         except OSError as error:
             raise UserError(f"cannot write to {folder}: {error.strerror}") from None
         replace_text(folder / "args.json", json.dumps(record, indent=1) + "\n")
-        claim(folder)
 
 
 def tensorboard():
@@ -294,8 +319,10 @@ def resumed(args, *may_change):
     UserError if the folder has no run, or one with other arguments than today's, or if more arguments are given.
     """
     path, fields = Path(args.resume) / "args.json", dataclasses.fields(args)
-    given = {f.name: getattr(args, f.name) for f in fields if f.name != "resume" and getattr(args, f.name) != f.default}
-    for name in given.keys() - {*may_change}:
+    flags = [word.split("=")[0][2:].replace("-", "_") for word in sys.argv[1:] if word.startswith("--")]
+    typed = {flag.removeprefix("no_") for flag in flags}  # also those with the value of the default
+    given = {f.name: getattr(args, f.name) for f in fields if f.name in typed or getattr(args, f.name) != f.default}
+    for name in sorted(given.keys() - {"resume", *may_change}):
         raise UserError(f"--{name.replace('_', '-')} cannot change with --resume; leave it out, or start a new run")
     try:
         record = json.loads(path.read_text())
@@ -309,13 +336,19 @@ def resumed(args, *may_change):
     if not intact:
         raise UserError(f"{path} is damaged; start the run again")
     if other:
-        raise UserError(f"{path} is of another version, which differs in {', '.join(other)[:99]}; start the run again")
+        raise UserError(
+            f"{path} is of another version or stage, which differs in {', '.join(other)[:99]}; start the run again"
+        )
     found = {f.name: tuple(record[f.name]) if isinstance(record[f.name], list) else record[f.name] for f in fields}
-    claim(args.resume)
-    if given:
-        replace_text(path, json.dumps(record | given, indent=1) + "\n")
-        claim(args.resume)  # the new file
     return type(args)(**found | given | {"resume": args.resume, "run_dir": args.resume, "force": False})
+
+
+def extend(args):
+    """Record in args.json that the run args.resume goes on to another total_steps."""
+    path = Path(args.resume) / "args.json"
+    record = json.loads(path.read_text())
+    if record.get("total_steps") != getattr(args, "total_steps", None):
+        replace_text(path, json.dumps(record | {"total_steps": args.total_steps}, indent=1) + "\n")
 
 
 def check_shapes(path, params, like):

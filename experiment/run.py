@@ -31,6 +31,7 @@ def typed(words):
 
 def make_env(make, name, args, **fields):
     """Build make(name, engine) with these fields of its config and then those of --set, or raise a UserError."""
+    devices.find()
     try:
         env = make(name, args.engine, **fields | typed(args.set))
         devices.check_engine(env.engine)
@@ -70,8 +71,13 @@ class Run:
         """
         print("  ".join(f"{name}={value}" for name, value in dataclasses.asdict(self.args).items()), flush=True)
         if self.args.resume:
+            records.claim(self.args.resume)
             state, self.rows[0] = records.load_state(self.args.resume, jax.eval_shape(lambda: init(self.args)))
             self.iteration = int(self.rows[0][-1]["iteration"]) if self.rows[0] else 0
+            if self.iteration > self.total:
+                raise records.UserError(f"{self.args.resume} has more than {self.args.total_steps} steps already")
+            if devices.is_first():
+                records.extend(self.args)
             if self.done:
                 print(f"{self.args.resume} has all its rows already; nothing is left to train")
             return [state]

@@ -32,7 +32,7 @@ import play
 import ppo_explore
 import ppo_finetune
 import pretrain_pidm
-from experiment import figures, records
+from experiment import devices, figures, records
 
 SIZES = (7_000, 70_000, 700_000)  # transitions
 EARLY = 100  # iterations of a task's training whose states the coverage figure shows (paper Fig. 4a)
@@ -308,6 +308,7 @@ def write_readme():
 
 
 def main(args):
+    devices.find()
     for robot in args.robots:
         if "collect" in args.stages:
             run("ppo_explore.py", "--robot", robot, "--preset", args.preset, "--force")

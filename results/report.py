@@ -458,7 +458,16 @@ def load_study(scale):
 
 def page(study, updates):
     """Text of results/README.md."""
-    lines = [HEAD, DISCUSSION.read_text(), "## Table I", "", *table_1(study), "", "![curves](study/curves.png)", ""]
+    lines = [
+        HEAD,
+        DISCUSSION.read_text("utf-8"),
+        "## Table I",
+        "",
+        *table_1(study),
+        "",
+        "![curves](study/curves.png)",
+        "",
+    ]
     lines += ["Where the methods stand before they have converged:", "", *along_the_way(study), ""]
     climbing = ("anymal_climb_up", "anymal_climb_down")
     loaded = {"pidm_pretrained": METHODS["pidm_pretrained"].title}
@@ -554,11 +563,11 @@ def main(args):
     if not study:
         raise records.UserError("results/study has no finished runs; run results/study.py")
     updates = any("pidm_pretrained" in runs and "pidm_random" in runs for runs in study.values())
-    readme = (ROOT / "README.md").read_text()
+    readme = (ROOT / "README.md").read_text("utf-8")
     pages = {ROOT / "results/README.md": page(study, updates), ROOT / "README.md": with_table(readme, study)}
     if args.check:
         for path, text in pages.items():
-            if not path.exists() or path.read_text() != text:
+            if not path.exists() or path.read_text("utf-8") != text:
                 sys.exit(f"{path.relative_to(ROOT)} is not what the runs give; run results/report.py")
         return None
     for path, text in pages.items():

@@ -1,6 +1,7 @@
 """The environment contract: hooks, history, resets, noise, randomisation, mirrors, broken simulations, options."""
 
 import dataclasses
+import io
 import re
 import sys
 
@@ -538,7 +539,7 @@ def test_configs_are_frozen_and_prop_is_sensed():
 # --- pictures ---
 
 
-def test_frames_of_a_strip_show_a_stride_in_different_phases(monkeypatch, tmp_path):
+def test_frames_of_a_strip_show_a_stride_in_different_phases(monkeypatch):
     """Frames carry the number of their step as their colour. No two in a row are near the same phase of a stride."""
 
     def draw(_, qpos):
@@ -548,11 +549,11 @@ def test_frames_of_a_strip_show_a_stride_in_different_phases(monkeypatch, tmp_pa
     monkeypatch.setattr(render, "draw", draw)
     env = envs.make("go1_loco", "c")
     steps = np.arange(500.0)[:, None]
-    render.film(env, steps, None, tmp_path, **env.FILM_WINDOW)
-    sheet = Image.open(tmp_path / "rollout.png")
+    pictures = render.film(env, steps, None, **env.FILM_WINDOW)
+    assert sorted(pictures) == ["rollout.gif", "rollout.png"]
+    sheet = Image.open(io.BytesIO(pictures["rollout.png"]))
     middles = [(render.WIDTH * (i % 5) + 160, render.HEIGHT * (i // 5) + 120) for i in range(10)]
     apart = np.diff([sheet.getpixel(at)[0] for at in middles]) * env.dt  # [s]
     for stride in np.arange(0.30, 0.46, 0.01):
         phase = apart / stride % 1
         assert (np.minimum(phase, 1 - phase) > 0.1).all(), stride
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["rollout.gif", "rollout.png"]

@@ -318,7 +318,7 @@ def shapes_of_pidm(net):
     return jax.eval_shape(net.init, jax.random.key(0), history, np.zeros(X, np.float32))["params"]
 
 
-def play(args, params, env, key):
+def roll_out(args, params, env, key):
     """The rollout in numpy: flat arrays (T N, ...) for `ppo`, and done (T, N), bootstrap (T, N) and last value (N,)."""
     frames, std = float64(env.frames), np.exp(params["params"]["log_std"])
     noise = float64(jax.jit(jax.vmap(lambda k: jax.random.normal(k, (N, A))))(jax.random.split(key, T)))
@@ -359,7 +359,7 @@ def orders(script, args, env, key):
 def train(script, args, env, params, lr, keys, extra_reward=0.0):
     """One PPO iteration in numpy."""
     k_roll, k_update = keys
-    roll, reward, bootstrap, done, last_value = play(args, params, env, k_roll)
+    roll, reward, bootstrap, done, last_value = roll_out(args, params, env, k_roll)
     value = roll["value"].reshape(T, N)
     roll["advantage"] = advantages(args, reward + bootstrap + extra_reward, done, value, last_value).ravel()
     roll["return"] = roll["advantage"] + roll["value"]
@@ -504,7 +504,7 @@ def test_iteration_of_stage_one(stage_one, number):
     params, ensemble, frames = float64(before.params), float64(before.ensemble), float64(env.frames)
 
     # the ensemble judges the rollout before it learns from it
-    roll, *_ = play(args, params, env, keys[0])
+    roll, *_ = roll_out(args, params, env, keys[0])
     prop, past = roll["inputs"]["prop"], roll["inputs"]["action"]
     delta = frames.final_history["prop"][1:, :, -1].reshape(-1, X) - prop[:, -1]
     seen = {"prop": prop, "past": past, "delta": delta, "action": roll["action"]}

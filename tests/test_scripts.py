@@ -115,14 +115,13 @@ def test_play_prints_and_draws(trained):
     assert 0 < report["task"]["episode_seconds"] < 20 and report["task"]["falls"] == 1.0
 
 
-def test_pictures_without_opengl(jitted, tmp_path, monkeypatch, capsys):
+def test_pictures_without_opengl(jitted, monkeypatch, capsys):
     """Where no OpenGL works, all of which are tried in processes of their own, matplotlib draws the same files."""
     env = jitted("g1_loco").env
     physics = jax.tree.map(lambda x: x[0], jitted("g1_loco").start(1).physics)
     monkeypatch.setattr(subprocess, "run", lambda *words, **kwargs: subprocess.CompletedProcess(words, 1, "", ""))
-    for picture in render.film(env, np.tile(physics.qpos, (60, 1)), physics, tmp_path):
-        assert picture.stat().st_size > 2000
-    assert {path.name for path in tmp_path.iterdir()} == {"rollout.png", "rollout.gif"}
+    pictures = render.film(env, np.tile(physics.qpos, (60, 1)), physics)
+    assert pictures.keys() == {"rollout.png", "rollout.gif"} and min(map(len, pictures.values())) > 2000
     assert "stick figures" in capsys.readouterr().out
 
 

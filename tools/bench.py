@@ -37,13 +37,15 @@ sys.path.insert(0, str(ROOT))
 os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
 
 import jax
-import mujoco
 import numpy as np
 import tyro
 
 import envs
-from envs.engine import cpu_count
-from experiment import records
+from envs.engine import (
+    cpu_count,
+    mujoco,  # envs comes first: it takes MUJOCO_GL out of the way
+)
+from experiment import devices, records
 
 Part = Literal["engines", "training", "seeds", "solver", "peers"]
 
@@ -279,6 +281,7 @@ def with_ratios(rows):
 
 
 def main(args):
+    devices.find()
     if args.cell:
         name, *inputs = json.loads(args.cell)
         return print(json.dumps(FIGURES[name](*inputs)))

@@ -19,7 +19,7 @@ sys.path.insert(0, str(ROOT))
 
 import envs
 from envs import parkour, render, terrain
-from experiment import records
+from experiment import devices, records
 
 LEVELS = (0, 4, 9)
 
@@ -47,6 +47,7 @@ def picture(env, level, key):
 
 
 def main():
+    devices.find()
     tasks = [task for task, (family, _) in envs.TASKS.items() if family is parkour.Parkour]
     sheet = Image.new("RGB", (render.WIDTH * len(LEVELS), render.HEIGHT * len(tasks)), "white")
     for row, task in enumerate(tasks):
@@ -62,4 +63,5 @@ def main():
 
 
 if __name__ == "__main__":
-    main()
+    with records.one_line_errors():
+        main()

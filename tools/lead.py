@@ -20,7 +20,7 @@ sys.path.insert(0, str(ROOT))
 import envs
 import play
 from envs import render, terrain
-from experiment.records import replace_bytes
+from experiment import devices, records
 
 # task -> robot's name, first instant [s], number of instants, least distance between them [m], robot's height [m]
 ROWS = {
@@ -99,6 +99,7 @@ def row(task, name, start, count, gap, tall):
 
 
 def main():
+    devices.find()
     images = [row(task, *about) for task, about in ROWS.items()]
     sheet = Image.new("RGB", (WIDTH, sum(image.height + BETWEEN for image in images) - BETWEEN), "white")
     top = 0
@@ -107,9 +108,10 @@ def main():
         top += image.height + BETWEEN
     file = io.BytesIO()
     sheet.quantize(128, dither=Image.Dither.NONE).save(file, "PNG", optimize=True)
-    replace_bytes(ROOT / "docs/walking.png", file.getvalue())
+    records.replace_bytes(ROOT / "docs/walking.png", file.getvalue())
     print("wrote docs/walking.png")
 
 
 if __name__ == "__main__":
-    main()
+    with records.one_line_errors():
+        main()

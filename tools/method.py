@@ -18,7 +18,7 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 
 import envs
-from experiment.records import replace_bytes
+from experiment import devices, records
 
 WIDTH, HEIGHT = 1600, 840
 TEXT = 24  # 9 points where the picture is shown 800 pixels wide
@@ -167,6 +167,7 @@ def legend(ax):
 
 
 def main():
+    devices.find()
     fig = Figure((WIDTH / 72, HEIGHT / 72), dpi=72)  # so that a point is a pixel
     ax = fig.add_axes((0, 0, 1, 1))
     ax.set(xlim=(0, WIDTH), ylim=(0, HEIGHT))
@@ -180,9 +181,10 @@ def main():
     legend(ax)
     file = io.BytesIO()
     fig.savefig(file, format="png", metadata={"Software": None})
-    replace_bytes(ROOT / "docs/method.png", file.getvalue())
+    records.replace_bytes(ROOT / "docs/method.png", file.getvalue())
     print("wrote docs/method.png")
 
 
 if __name__ == "__main__":
-    main()
+    with records.one_line_errors():
+        main()

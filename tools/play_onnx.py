@@ -9,10 +9,13 @@ forward velocity and the turning rate, 7 and 9 the sideways velocity, and the sp
 """
 
 import json
+import os
 import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
+
+os.environ.pop("MUJOCO_GL", None)  # with some values MuJoCo does not load; a window needs none
 
 import mujoco
 import numpy as np
@@ -68,10 +71,20 @@ class Player:
         spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 0.1], contype=0, conaffinity=1)
         spec.worldbody.add_light(pos=[0, 0, 3])
         self.model = spec.compile()
+        self.set_gains()
         self.data = mujoco.MjData(self.model)
         self.decimation = round(self.facts["dt"] / self.model.opt.timestep)
         self.history = None
         self.stand()
+
+    def set_gains(self):
+        """Give the motors the gains and limits of the policy file, whatever the MJCF has."""
+        m, f = self.model, self.facts
+        for name, kp, kd, limit in zip(f["joints"], f["kp"], f["kd"], f["torque_limit"], strict=True):
+            motor = int(np.flatnonzero(m.actuator_trnid[:, 0] == m.joint(name).id)[0])
+            m.actuator_gainprm[motor, 0], m.actuator_biasprm[motor, :3] = kp, (0.0, -kp, 0.0)
+            m.actuator_forcerange[motor] = -limit, limit
+            m.dof_damping[m.joint(name).dofadr] = kd
 
     def stand(self):
         """Put the robot into its default pose, feet on the ground."""

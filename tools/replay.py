@@ -17,7 +17,6 @@ from pathlib import Path
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 import optax
 import tyro
@@ -27,6 +26,7 @@ sys.path.insert(0, str(ROOT))
 
 import envs
 import ppo_finetune
+from envs.engine import mujoco  # envs comes first: it takes MUJOCO_GL out of the way
 from experiment import records
 from experiment.run import make_env
 
