@@ -108,7 +108,7 @@ def test_only_the_first_host_prints_and_writes(runs):
 
 def test_stage_one_on_two_hosts_and_stage_two_on_two_devices(tmp_path):
     """Data of two processes are those of one, and so is the PIDM that two devices make of them."""
-    collect = ["ppo_explore.py", "--robot", "go1", *SMOKE, "--total-steps", "128", "--run-dir"]
+    collect = ["ppo_explore.py", "--robot", "go1", *SMOKE, "--set", "rough=0", "--total-steps", "128", "--run-dir"]
     finish(start([*collect, tmp_path / "one"]))
     finish(*hosts([*collect, tmp_path / "two"]))
     arrays = [np.load(tmp_path / name / "x.npy") for name in ("one", "two")]

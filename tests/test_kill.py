@@ -47,7 +47,7 @@ def saved_rows(folder):
 @pytest.fixture(scope="module")
 def data(tmp_path_factory):
     out = tmp_path_factory.mktemp("kill") / "data"
-    ppo_explore.main(ppo_explore.Args(preset="smoke", run_dir=str(out)))
+    ppo_explore.main(ppo_explore.Args(preset="smoke", total_steps=800, run_dir=str(out)))
     return out
 
 
