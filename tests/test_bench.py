@@ -11,7 +11,7 @@ from tools import bench
 
 def test_a_figure_from_a_process_of_its_own():
     row = bench.in_process(120, "stepping", "go1_loco", "c", 4, False)
-    assert row["steps/s"] > 0 and row["compile s"] > 0 and 50 < row["MiB"] < 4000
+    assert row["steps/s"] > 0 and row["compile s"] > 0 and row["MiB"] > 50
 
 
 def test_a_failure_gives_its_reason():

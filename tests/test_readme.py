@@ -86,6 +86,9 @@ def test_commands_run(command, workplace, monkeypatch, capsys):
         pytest.importorskip(FORMS[word])
     module = importlib.import_module(script.removesuffix(".py").replace("/", "."))
     small = [] if "--eval" in words else SMALL.get(script, "").split()
+    if script == "play.py":
+        words += [] if "--set" in words else ["--set"]
+        words.insert(words.index("--set") + 1, "episode_seconds=2.0")
     args = tyro.cli(module.Args, args=[*words, *small])
     if {*words} & {*NEED_A_PERSON} or script in WRITES_HERE:
         return
