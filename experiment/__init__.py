@@ -1,1 +1,1 @@
-"""What a run does around the algorithm: its folder, files, progress, figures and devices. Nothing in here learns."""
+"""Everything around the algorithm: run folders, files, progress, figures and devices. Nothing in here learns."""

@@ -106,12 +106,12 @@ class Run:
 
     @property
     def done(self):
-        """Whether the run has made its iterations, or was asked to stop."""
+        """True once the run has made its iterations, or was asked to stop."""
         return self.iteration >= self.total or self.stopped
 
     @property
     def due(self):
-        """Whether it is time to save what --resume needs."""
+        """True when it is time to save the state for --resume."""
         return self.last - self.saved >= 60 * self.args.save_minutes
 
     def seconds(self):

@@ -177,7 +177,7 @@ def test_collections(collection, tmp_path):
 
 
 def test_run_folders(tmp_path, capsys, monkeypatch):
-    """What the report reads: a damaged run is named and left out."""
+    """The report names a damaged run and leaves it out."""
     monkeypatch.setattr(report, "ROOT", tmp_path)
     rng, folder, left_out = random.Random(4), tmp_path / "seed0", 0
     folder.mkdir()

@@ -39,7 +39,7 @@ def rows_of(folder):
 
 
 def saved_rows(folder):
-    """How many rows the state holds from which --resume goes on; it is whole."""
+    """Number of rows in the state from which --resume goes on; the state is whole."""
     content = flax.serialization.msgpack_restore((folder / records.STATE).read_bytes())
     return len(json.loads(content["rows"]))
 

@@ -18,7 +18,7 @@ CHUNKS, T, N = 3, 5, 4  # iterations per row, control steps, environments
 
 @flax.struct.dataclass
 class Step:
-    """What `step_metrics` reads of an environment's state."""
+    """The part of an environment's state that `step_metrics` reads."""
 
     reward: np.ndarray
     terminated: np.ndarray
@@ -98,7 +98,7 @@ def test_curves_show_what_a_row_has(monkeypatch, tmp_path):
 
 @flax.struct.dataclass
 class Policy:
-    """What `Run` reads of a stacked TrainState."""
+    """The part of a stacked TrainState that `Run` reads."""
 
     params: dict
 

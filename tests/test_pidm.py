@@ -357,7 +357,7 @@ def test_normalizer_is_not_trained(pretrained, tmp_path):
 
 
 def test_commanded_change_is_target_minus_joint_angle(go1):
-    """What MuJoCo's position actuators were told in a step, minus where their joints were before it."""
+    """Targets of MuJoCo's position actuators in a step, minus the joint angles before it."""
     state = jax.jit(jax.vmap(go1.reset))(jax.random.split(jax.random.key(0), 1))
     action = jnp.linspace(-2, 2, A)[None]
     angles = jax.vmap(go1.motion)(state.physics).joint_pos
@@ -480,7 +480,7 @@ def test_a_refused_checkpoint_costs_no_run(pretrained, tmp_path, refused):
 
 
 def test_gathering_errors_are_raised(dataset, monkeypatch):
-    """What goes wrong on the gathering thread reaches the training instead of stopping it for ever."""
+    """An error on the gathering thread reaches the training instead of stopping it for ever."""
     monkeypatch.setattr(dataset, "windows", lambda index: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         list(script.batches(dataset, dataset.train, 8))

@@ -51,7 +51,7 @@ def test_gae_matches_a_loop():
 
 
 def test_termination_cuts_the_advantage():
-    """What follows an end of episode has no influence on what stood before it."""
+    """Steps after the end of an episode do not change the advantages before it."""
     value, done = jnp.ones((3, 1)), jnp.array([[0.0], [1.0], [0.0]])
     calm, _ = script.gae(ARGS, jnp.zeros((3, 1)), done, value, jnp.array([0.0]))
     wild, _ = script.gae(ARGS, jnp.array([[0.0], [0.0], [99.0]]), done, value, jnp.array([99.0]))

@@ -82,7 +82,7 @@ class Simulation:
 
 
 class Memory:
-    """What a reference remembers of an episode."""
+    """Memory of a reference within an episode."""
 
     def __init__(self, env):
         feet = len(env.robot.feet)

@@ -1,4 +1,4 @@
-"""What ruff cannot check: size, dead arguments, long or nested functions, imports that go upwards, deviations."""
+"""Checks beyond ruff's: size, dead arguments, long or nested functions, imports that go upwards, deviations."""
 
 import ast
 import re
