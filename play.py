@@ -21,7 +21,8 @@ import tyro
 
 import envs
 import ppo_finetune
-from experiment import metrics, records
+from envs.locomotion import Locomotion
+from experiment import gait, metrics, records
 from experiment.run import make_env, typed
 
 
@@ -53,7 +54,8 @@ def load_policy(path, engine="auto", overrides=(), **fields):
     params, meta = records.load(Path(path), "policy")
     trained = {name: meta["args"].get(name) for name in ("network", "init_std", "hidden", "intention")}
     args = ppo_finetune.Args(task=meta["task"], engine=engine, set=tuple(overrides), **trained)
-    env = make_env(envs.make, args.task, args, **typed(meta["args"].get("set", ())) | fields)
+    make = partial(envs.make, robust=meta["args"].get("robust", False))
+    env = make_env(make, args.task, args, **typed(meta["args"].get("set", ())) | fields)
     net = ppo_finetune.make_net(args, env)
     state = jax.eval_shape(env.reset, jax.random.key(0))
     like = jax.eval_shape(net.init, jax.random.key(0), net.inputs(state.obs, state.history))
@@ -80,7 +82,7 @@ def load(args, kind="EVALUATION_FIELDS", **fields):
 
 
 def evaluate(env, net, params, episodes, level=None):
-    """One episode per environment with the mean action, fixed seed. Metrics, first physics, its qpos (steps, nq)."""
+    """One episode per environment with the mean action, fixed seed. Metrics, first state, its qpos (steps, nq)."""
 
     def step(carry, _):
         env_state, alive = carry
@@ -95,7 +97,14 @@ def evaluate(env, net, params, episodes, level=None):
     carry = env_state, jnp.ones(episodes, bool)
     _, (report, alive, ended, fell, qpos) = jax.lax.scan(step, carry, None, env.episode_steps)
     result = metrics.of_first_episodes(report, alive, ended) | {"falls": fell.any(0).mean()}
-    return result, jax.tree.map(lambda x: x[0], env_state.physics), qpos
+    return result, jax.tree.map(lambda x: x[0], env_state), qpos
+
+
+def title(env, meta):
+    """Level, where the task has some, and method of a policy, for its pictures."""
+    trained = meta["args"]
+    kind = "pretrained PIDM" if trained["pretrained"] else {"mlp": "MLP", "pidm": "random PIDM"}[trained["network"]]
+    return f"level {env.config.level}, {kind}" if env.LEVELS else kind
 
 
 def run_evaluation(args):
@@ -117,9 +126,16 @@ def run_evaluation(args):
     fields = {name: getattr(show.config, name) for name in show.SHOWCASE_FIELDS}
     print(f"showcase {fields}:", records.line(shown))
     report = jax.tree.map(float, report | {"showcase": shown}) | {"showcase_config": fields}
+    if isinstance(env, Locomotion):
+        from tools import gait as walks  # it imports this file
+
+        few = {"starts": min(max(args.episodes // 3, 1), 20), "engine": args.engine}
+        by_command, report["gait"] = walks.evaluate(walks.Args(args.policy, args.set, **few))
+        print(gait.lines(by_command, report["gait"]))
     folder = Path(args.policy).parent
     records.replace_text(folder / "eval.json", json.dumps(report, indent=1) + "\n")
-    for name, picture in render.film(show, qpos, start, **show.FILM_WINDOW).items():
+    shown_with = {"title": title(show, meta), "markers": show.markers(start.task)}
+    for name, picture in render.film(show, qpos, start.physics, **shown_with, **show.FILM_WINDOW).items():
         records.replace_bytes(folder / name, picture)
         print(f"wrote {folder / name}")
 
@@ -132,11 +148,11 @@ def film(args):
     from envs import render
 
     path = Path(args.video)
-    env, net, params, _ = load(args, "SHOWCASE_FIELDS")
+    env, net, params, meta = load(args, "SHOWCASE_FIELDS")
     try:
         render.check_video(path)
         _, start, qpos = jax.jit(lambda params: evaluate(env, net, params, 1))(params)
-        records.write(path, render.video(env, qpos, start, path))
+        records.write(path, render.video(env, qpos, start.physics, path, title(env, meta), env.markers(start.task)))
     except ValueError as error:
         raise records.UserError(str(error)) from None
     print(f"wrote {path}")
@@ -179,7 +195,7 @@ def onboard(env, net, params):
         history = {"prop": jnp.concatenate([given["prop_history"], prop[None]]), "action": past}
         inputs = net.inputs(env.pack(given), history)
         action = net.apply(params, jax.tree.map(lambda x: x[None], inputs), method=net.mean)[0]
-        target = env.default_pose + env.robot.action_scale * action
+        target = env.default_pose + env.action_scale * action
         return action, target, history["prop"][1:], jnp.concatenate([past, action[None]])[1:]
 
     return policy, shapes
@@ -210,12 +226,13 @@ def export_onnx(args):
         "dt": env.dt,  # [s] control step
         "joints": list(env.robot.joints),
         "default_pose": np.asarray(env.default_pose).tolist(),  # [rad]
-        "action_scale": [env.robot.action_scale] * env.action_dim,  # [rad] a unit of action
+        "action_scale": list(env.robot.action_scale),  # [rad] a unit of action
         "kp": env.model.actuator_gainprm[:, 0].tolist(),  # [N m / rad]
         "kd": env.model.dof_damping[6:].tolist(),  # [N m s / rad]; the MJCF has it as damping of the joints
         "torque_limit": env.model.actuator_forcerange[:, 1].tolist(),  # [N m] of the kp part
         "history": env.config.history,
         "prop": list(env.prop_layout),
+        **({"gait_hz": env.config.gait_hz} if "phase" in shapes else {}),  # of the input `phase`
         "versions": records.versions(),
     }
     onnx.helper.set_model_props(model, {name: json.dumps(value) for name, value in facts.items()})

@@ -45,6 +45,7 @@ class Args:
     seed: int = 0  # the only source of randomness
     num_seeds: int = 1  # train seed, seed + 1, ... in one program, each in its own run folder
     engine: str = "auto"  # physics: c (CPU threads), mjx (accelerators), warp (NVIDIA)
+    robust: bool = False  # train for use on a robot: delays, pushes, masses, friction, commands as people give them
     set: tuple[str, ...] = ()  # NAME=VALUE of the task's config, e.g. friction=0.3,1.2 weights.slip=-0.2
     # --- Records ---
     run_dir: str | None = None  # None: runs/<task>/<method>/seed<seed>
@@ -497,13 +498,12 @@ def iteration(args, env, net, opt, state):
     env_state, roll, report = rollout(args, env, net, state.params, state.env, k_roll)
     last_value = net.apply(state.params, net.inputs(env_state.obs, env_state.history), method=net.value)
     advantage, ret = gae(args, roll.reward + roll.bootstrap, roll.done, roll.value, last_value)
-    before = state.params
-    state, losses = update(args, env, net, opt, state, (roll, advantage, ret), k_update)
+    new, losses = update(args, env, net, opt, state, (roll, advantage, ret), k_update)
     report = metrics.over_time(report) | losses
-    report |= metrics.update_magnitude(before, state.params) if args.network == "pidm" else {}
+    report |= metrics.update_magnitude(state.params, new.params) if args.network == "pidm" else {}
     report["explained_variance"] = 1 - jnp.var(ret - roll.value) / (jnp.var(ret) + 1e-8)
-    report |= {"lr": state.lr, "action_std": jnp.exp(state.params["params"]["log_std"]).mean()}
-    return state.replace(env=env_state, iteration=state.iteration + 1), report
+    report |= {"lr": new.lr, "action_std": jnp.exp(new.params["params"]["log_std"]).mean()}
+    return new.replace(env=env_state, iteration=state.iteration + 1), report
 
 
 def init_state(args, env, net, opt):
@@ -532,7 +532,7 @@ def make_chunk(args, env, net, opt, states):
 
 def train(args):
     """Run PPO to the end, or to Ctrl-C or SIGTERM. Either way each seed's folder holds a policy, metrics and curve."""
-    env = make_env(envs.make, args.task, args)
+    env = make_env(partial(envs.make, robust=args.robust), args.task, args)
     args = merge(args, env.config.ppo)
     net, opt = make_net(args, env), optax.scale_by_adam()  # `update` multiplies by the adapted step size
     run = Run(args, env.config, planned_iterations(args), SHOWN)

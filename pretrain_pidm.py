@@ -387,7 +387,7 @@ def checkpoint_meta(args, data, sizes, row):
 def commanded_change(env, x, action):
     """Joint target minus joint angle, a_t - q_t [rad]: the paper's action. x (..., X), action (..., A)."""
     # joint_pos is relative to the default pose, and so is the target
-    return env.robot.action_scale * action - x[..., env.prop_slices()["joint_pos"]]
+    return np.float32(env.robot.action_scale) * action - x[..., env.prop_slices()["joint_pos"]]
 
 
 def predict_all(args, env, net, variables, data, index):
@@ -417,13 +417,14 @@ def predict_all(args, env, net, variables, data, index):
 def errors(env, data, outcome):
     """Mean absolute error in several units, and that of two baselines: the mean action and the last one."""
     action = outcome["action"]
-    error = np.abs(outcome["predicted"] - action).mean()
+    wrong = np.abs(outcome["predicted"] - action)
+    error, error_rad = wrong.mean(), (wrong * np.float32(env.robot.action_scale)).mean()
     sample = data.windows(np.sort(data.train[:: max(len(data.train) // 20_000, 1)]))["action"]
     return {
         "error": error,  # [action units]
-        "error_rad": error * env.robot.action_scale,
+        "error_rad": error_rad,
         "normalized_error": error / np.abs(action).mean(),
-        "error_over_change": error * env.robot.action_scale / np.abs(outcome["change"]).mean(),
+        "error_over_change": error_rad / np.abs(outcome["change"]).mean(),
         "mean_action_error": np.abs(action - sample.mean(0)).mean(),
         "last_action_error": np.abs(action - outcome["last"]).mean(),
     }
@@ -434,7 +435,7 @@ def validate(args, env, net, variables, data, folder):
     outcome = predict_all(args, env, net, variables, data, data.validation)
     result = {name: float(x) for name, x in errors(env, data, outcome).items()}
     records.replace_text(folder / "validation.json", json.dumps(result, indent=1) + "\n")
-    wrong = env.robot.action_scale * (outcome["predicted"] - outcome["action"])
+    wrong = np.float32(env.robot.action_scale) * (outcome["predicted"] - outcome["action"])
     figures.plot_accuracy(outcome["change"], wrong, folder / "accuracy.png")
     index = np.sort(np.concatenate([data.train, data.validation]))
     at = np.divmod(index[:: max(len(index) // 50_000, 1)], data.x.shape[1])

@@ -3,7 +3,7 @@
 import jax
 
 from envs import gl, locomotion, parkour, pedipulation  # noqa: F401, gl comes before all that imports MuJoCo
-from envs.config import replace_checked
+from envs.config import FIXED, replace_checked
 from envs.explore import EXPLORE, Explore
 
 JAX_SETTINGS = {  # whatever JAX's variables of these names say: other values end in errors, or in other numbers
@@ -30,14 +30,21 @@ TASKS = {
 }
 
 
-def make(task, engine="auto", /, **overrides):
+def make(task, engine="auto", /, robust=False, **overrides):
     """Build a task's environment. Overrides replace fields of its config, as in make("go1_loco", noise=0.0).
 
-    ValueError for an unknown task, engine or field, naming those that exist, and for a value of a wrong type.
+    `robust` first replaces those of its config's set for use on a robot. ValueError for an unknown task, engine or
+    field, naming those that exist, for a value of a wrong type, and for `robust` where the task has no such set.
     """
     if task not in TASKS:
         raise ValueError(f"unknown task {task!r}; choose one of {', '.join(TASKS)}")
     family, config = TASKS[task]
+    if not isinstance(robust, bool):  # text after --set robust=
+        raise ValueError(f"robust cannot be set: {FIXED['robust']}")
+    if robust and not config.robust:
+        known = ", ".join(name for name, (_, config) in TASKS.items() if config.robust)
+        raise ValueError(f"{task} has no robust set; {known} have one")
+    config = replace_checked(config, config.robust if robust else {})
     return family(replace_checked(config, overrides), engine)
 
 

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from envs import terrain
-from envs.engine import Physics, make_engine
+from envs.engine import RANDOMISED, Physics, make_engine
 from envs.robots import AXIAL, POLAR, ROBOTS
 from envs.rotations import axis_angle, inverse, multiply, rotate, yaw_of
 
@@ -49,6 +49,9 @@ class State:
     action: jax.Array  # (A,) of the last step, 0 at the start
     clock: jax.Array  # () control steps since the episode began
     push_at: jax.Array  # () clock of the next push
+    delay: jax.Array  # () [control steps] from an action to its joint targets
+    lag: jax.Array  # () [control steps] age of the readings, 0 to 1
+    readings: dict  # true values of NOISE's quantities in the last step
     episode_return: jax.Array  # () sum of rewards so far
     key: jax.Array
     task: flax.struct.PyTreeNode  # state of the task family
@@ -96,6 +99,12 @@ class FootClocks:
     contact_time: jax.Array  # (F,) [s] since it landed
     landed_after: jax.Array  # (F,) [s] flight that ended in this step, else 0
 
+    @classmethod
+    def started(cls, feet, **task):
+        """Clocks of `feet` feet at the start of an episode; further fields for a task that adds some."""
+        zero = jnp.zeros(feet)
+        return cls(zero, zero, zero, **task)
+
     def tick(self, contact, dt):
         """Advance by one control step; contact (F,) bool."""
         return self.replace(
@@ -136,14 +145,20 @@ class Env:
 
     def __init__(self, config, engine="auto"):
         self.config, self.robot = config, ROBOTS[config.robot]
+        self.dt = config.physics_dt * config.decimation  # [s] control step
+        for name, most in (("action_delay", (config.history - 1) * self.dt), ("sensor_lag", self.dt)):
+            if not 0 <= getattr(config, name)[0] <= getattr(config, name)[1] <= most:
+                raise ValueError(f"{name} must be from 0 to {most:g} s, not {getattr(config, name)}")
         spec = self.scene()
         spec.option.timestep = config.physics_dt
+        for joint in spec.joints[1:] if config.joint_friction[1] else ():
+            joint.frictionloss = config.joint_friction[1]
         self.engine = make_engine(engine, spec, config.decimation)
         self.model = self.engine.model
-        self.dt = config.physics_dt * config.decimation  # [s] control step
         self.episode_steps = round(config.episode_seconds / self.dt)
         self.action_dim = len(self.robot.joints)
         self.default_pose = jnp.array(self.robot.default_pose)
+        self.action_scale = jnp.array(self.robot.action_scale)
         self.foot_sensors = {
             kind: self.engine.sensor(*(f"{foot}_{kind}" for foot in self.robot.feet))
             for kind in ("pos", "vel", "force")
@@ -216,6 +231,10 @@ class Env:
         """Numbers to log, by name; see `metrics`."""
         return {}
 
+    def markers(self, task):
+        """Points (n, 3) [m] to draw into pictures, such as a target."""
+        return jnp.zeros((0, 3))
+
     def set_command(self, task, command):
         """Task state with its command replaced; command has a number for each of COMMAND_RANGES."""
         return task
@@ -224,7 +243,7 @@ class Env:
 
     def reset(self, key, clock=None, curriculum=None):
         """Start an episode. A `clock` above 0 starts it midway, so that a batch's time limits spread out."""
-        k_course, k_clock, k_spawn, k_task, k_noise, k_push, key = jax.random.split(key, 7)
+        k_course, k_clock, k_spawn, k_task, k_noise, k_push, k_delay, k_lag, key = jax.random.split(key, 9)
         course = self.course(k_course, self.first_curriculum() if curriculum is None else curriculum)
         physics = self.spawn(k_spawn, course)
         task = self.init_task(k_task, physics, course)
@@ -249,6 +268,9 @@ class Env:
             action=action,
             clock=clock,
             push_at=clock + self.push_interval(k_push),
+            delay=uniform(k_delay, *self.config.action_delay) / self.dt,
+            lag=uniform(k_lag, *self.config.sensor_lag) / self.dt,
+            readings={name: getattr(motion, name) for name in NOISE},
             episode_return=zero,
             key=key,
             task=task,
@@ -258,7 +280,7 @@ class Env:
     def step(self, state, action):
         """Advance by one control step and, if the episode ends there, start the next one. action (A,)."""
         key, k_noise, k_task, k_push, k_curriculum, k_reset = jax.random.split(state.key, 6)
-        physics = self.engine.step(state.physics, self.default_pose + self.robot.action_scale * action)
+        physics = self.engine.step(state.physics, self.joint_targets(state, action))
         healthy = jnp.all(jnp.abs(physics.qpos) < DIVERGED) & jnp.all(jnp.abs(physics.qvel) < DIVERGED)  # NaN fails
         physics = select(healthy, physics, self.standing(state.physics))  # later numbers stay finite
 
@@ -284,7 +306,9 @@ class Env:
         physics, push_at = self.push(k_push, physics, clock, state.push_at)
         motion = self.motion(physics)
         task = self.after_rewards(k_task, task, motion, clock)
-        sensed, prop = self.sense(k_noise, motion, task)
+        readings = {name: getattr(motion, name) for name in NOISE}
+        late = {name: now + state.lag * (state.readings[name] - now) for name, now in readings.items()}
+        sensed, prop = self.sense(k_noise, motion.replace(**late), task)
         stepped = state.replace(
             physics=physics,
             obs=self.observe(sensed, task, action, motion, clock),
@@ -295,6 +319,7 @@ class Env:
             action=action,
             clock=clock,
             push_at=push_at,
+            readings=readings,
             episode_return=state.episode_return + reward,
             key=key,
             task=task,
@@ -310,6 +335,17 @@ class Env:
             | {"episode_return": stepped.episode_return, "episode_seconds": clock.astype(jnp.float32) * self.dt},
         )
 
+    def joint_targets(self, state, action):
+        """Joint targets (A,) [rad] of this control step: those of the action, or of earlier ones if it is delayed.
+
+        A delay that is no whole number of steps mixes two actions, by the share of the step for which each holds.
+        """
+        actions = jnp.concatenate([state.history["action"], action[None]])[::-1]  # newest first
+        whole = state.delay.astype(int)
+        older = state.delay - whole
+        mixed = (1 - older) * actions[whole] + older * actions[whole + 1]
+        return self.default_pose + self.action_scale * mixed
+
     def metrics(self, physics, healthy, terms, task, motion, truncated):
         """Metrics of one step: weighted reward terms, the task's metrics, faults of the engine, the finished episode.
 
@@ -322,7 +358,7 @@ class Env:
     def spawn(self, key, course):
         """Physics at the start of an episode: near the default pose, at a random place, feet on the ground."""
         c, m = self.config, self.model
-        k_place, k_link, k_joint, k_vel, k_friction, k_mass = jax.random.split(key, 6)
+        k_place, k_link, k_joint, k_vel, k_friction, k_mass, k_motor, k_rub = jax.random.split(key, 8)
         joints = self.default_pose * uniform(k_joint, *c.spawn_joints, (self.action_dim,))
         low, high = m.jnt_range[1:].T
         joints = jnp.clip(joints, low, high)
@@ -336,14 +372,22 @@ class Env:
         base = 1  # the first body after the world
         added = uniform(k_mass, *c.added_mass)
         mass_scale = uniform(k_link, *c.link_mass, (m.nbody,)).at[base].add(added / m.body_mass[base])
-        physics = self.engine.initial(qpos, qvel, uniform(k_friction, *c.friction), mass_scale)
+        physics = self.engine.initial(
+            qpos,
+            qvel,
+            friction=uniform(k_friction, *c.friction),
+            mass_scale=mass_scale,
+            strength=uniform(k_motor, *c.motor_strength, (self.action_dim,)),
+            joint_friction=uniform(k_rub, *c.joint_friction),
+        )
         return physics.replace(mocap_pos=course.mocap_pos, mocap_quat=course.mocap_quat)
 
     def standing(self, physics):
         """Physics with the robot at rest in its default pose, and the surroundings of `physics`."""
         m = self.model
         qpos = jnp.concatenate([jnp.array([0.0, 0, 1, 1, 0, 0, 0]), self.default_pose])
-        at_rest = self.engine.initial(qpos, jnp.zeros(m.nv), physics.friction, physics.mass_scale)
+        drawn = {name: getattr(physics, name) for name in RANDOMISED}
+        at_rest = self.engine.initial(qpos, jnp.zeros(m.nv), **drawn)
         return at_rest.replace(mocap_pos=physics.mocap_pos, mocap_quat=physics.mocap_quat)
 
     def push_interval(self, key):
@@ -415,7 +459,7 @@ class Env:
 
     def width(self, kind):
         """Length of a block."""
-        return {"joint": self.action_dim, "scalar": 1, "heading": 2}.get(kind, 3)
+        return {"joint": self.action_dim, "scalar": 1, "heading": 2, "phase": 2}.get(kind, 3)
 
     def obs_slices(self):
         """Slice of `obs` of each block, by name."""
@@ -465,6 +509,7 @@ class Env:
             "planar": np.array([polar[0], polar[1], axial[2]]),
             "scalar": np.array([1]),
             "heading": np.array([-1, 1]),  # sine, cosine of an angle about z
+            "phase": np.array([-1, -1]),  # sine, cosine of a gait's clock; the other foot is half a step ahead
         }
         return np.arange(len(signs[kind])), signs[kind]
 

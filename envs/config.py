@@ -5,7 +5,7 @@ import dataclasses
 import types
 import typing
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -20,6 +20,7 @@ class Config:
     robot: str
     weights: dict[str, float]  # reward term -> weight
     ppo: dict  # the task's own PPO settings, which ppo_finetune.py reads
+    robust: dict = field(default_factory=dict)  # fields that --robust replaces, for use on a robot; {}: none
     episode_seconds: float = 20.0
     physics_dt: float = 0.005  # [s]
     decimation: int = 4  # physics steps per control step
@@ -39,6 +40,10 @@ class Config:
     friction: Range = (0.7, 0.7)
     added_mass: Range = (0.0, 0.0)  # [kg] on the base
     link_mass: Range = (1.0, 1.0)  # factor on the mass and inertia of each link
+    motor_strength: Range = (1.0, 1.0)  # factor on each joint's kp
+    joint_friction: Range = (0.0, 0.0)  # [N m] dry friction of all joints
+    action_delay: Range = (0.0, 0.0)  # [s] from an action to the joint targets that follow it
+    sensor_lag: Range = (0.0, 0.0)  # [s] age of the readings, at most a control step
     # pushes: sudden changes of the base's velocity
     push_velocity: float = 0.0  # [m/s, rad/s] half-width
     push_axes: Literal[2, 6] = 2  # components: the horizontal velocity, or linear and angular velocity
@@ -46,12 +51,16 @@ class Config:
 
     def __post_init__(self):
         for name in POSITIVE:
-            if getattr(self, name, 1) <= 0:
+            if np.min(getattr(self, name, 1)) <= 0:
                 raise ValueError(f"{name} must be above 0, not {getattr(self, name)}")
 
 
 POSITIVE = ("episode_seconds", "physics_dt", "decimation", "history", "command_seconds", "perturb_seconds", "amplitude")
-FIXED = {"robot": "it belongs to the task", "ppo": "PPO's settings are flags of their own, like --lr"}
+FIXED = {
+    "robot": "it belongs to the task",
+    "ppo": "PPO's settings are flags of their own, like --lr",
+    "robust": "--robust turns it on as a whole",
+}
 UNIONS = (types.UnionType, typing.Union)
 WORDS = {  # annotation -> words for it in an error line
     bool: "true or false",

@@ -67,11 +67,16 @@ class Physics:
     wrench: jax.Array  # (nbody, 6) force [N] and torque [N m] on each body, world frame
     friction: jax.Array  # () sliding coefficient of all the robot's geoms
     mass_scale: jax.Array  # (nbody,) factor on mass and inertia
+    strength: jax.Array  # (nu,) factor on kp
+    joint_friction: jax.Array  # () [N m] dry friction of the joints that have any in the model
     # measured in the last step
     qacc: jax.Array  # (nv,) of the last physics step
     torque: jax.Array  # (nu,) [N m] kp part from the last physics step, kd part from the present velocities
     sensors: jax.Array  # (S,) present site poses and velocities, contact forces of the last physics step
     overflow: jax.Array  # () bool: a bounded engine dropped contacts or constraints in the last control step
+
+
+RANDOMISED = ("friction", "mass_scale", "strength", "joint_friction")  # fields of Physics, drawn once an episode
 
 
 class Engine:
@@ -83,18 +88,18 @@ class Engine:
     def __init__(self, spec, decimation):
         self.model, self.decimation = spec.compile(), decimation
         self.robot_geoms = self.model.geom_contype > 0
+        self.rubbing = self.model.dof_frictionloss > 0
 
-    def initial(self, qpos, qvel, friction, mass_scale):
-        """Physics at a given state, with nothing measured yet."""
+    def initial(self, qpos, qvel, **randomised):
+        """Physics at a given state, with nothing measured yet. randomised: values of the fields in RANDOMISED."""
         m = self.model
         return Physics(
+            **randomised,
             qpos=qpos,
             qvel=qvel,
             mocap_pos=jnp.zeros((m.nmocap, 3)),
             mocap_quat=jnp.tile(jnp.array([1.0, 0, 0, 0]), (m.nmocap, 1)),
             wrench=jnp.zeros((m.nbody, 6)),
-            friction=friction,
-            mass_scale=mass_scale,
             qacc=jnp.zeros(m.nv),
             torque=jnp.zeros(m.nu),
             sensors=jnp.zeros(m.nsensordata),
@@ -113,7 +118,7 @@ class Engine:
         """PD torque (nu,) [N m]: the limited kp part, and the kd part that the MJCF holds as joint damping."""
         return qfrc_actuator[6:] - self.model.dof_damping[6:] * qvel[6:]
 
-    def randomised(self, xp, friction, mass_scale):
+    def randomised(self, xp, friction, mass_scale, strength, joint_friction):
         """Model fields of simulations with any leading dimensions; xp is numpy or jax.numpy."""
         m = self.model
         sliding = xp.where(self.robot_geoms, friction[..., None], m.geom_friction[:, 0])
@@ -123,6 +128,10 @@ class Engine:
             "geom_friction": xp.concatenate([sliding[..., None], rest], -1),
             "body_mass": m.body_mass * mass_scale,
             "body_inertia": m.body_inertia * mass_scale[..., None],
+            "actuator_gainprm": m.actuator_gainprm * strength[..., None],
+            "actuator_biasprm": m.actuator_biasprm * strength[..., None],
+            # In MJX a joint with friction 0 is held, as if nothing limited its friction.
+            "dof_frictionloss": xp.where(self.rubbing, xp.maximum(joint_friction[..., None], 1e-6), 0.0),
         }
 
 
@@ -130,7 +139,7 @@ class CEngine(Engine):
     """MuJoCo C on all CPU threads. Results do not depend on the number of threads."""
 
     many_devices = False  # one callback takes the arrays of all simulations
-    INPUTS = ("qpos", "qvel", "mocap_pos", "mocap_quat", "wrench", "friction", "mass_scale")
+    INPUTS = ("qpos", "qvel", "mocap_pos", "mocap_quat", "wrench", *RANDOMISED)
     OUTPUTS = ("qpos", "qvel", "qacc", "sensors", "qfrc_actuator")
     # field of Physics -> that of MjData, where the names differ
     MUJOCO = {"wrench": "xfrc_applied", "sensors": "sensordata"}
@@ -163,7 +172,7 @@ class CEngine(Engine):
         count = int(np.prod(lead))
         with self.lock:
             batch = self.batch(count)
-            fields = self.randomised(np, inputs.pop("friction"), inputs.pop("mass_scale"))
+            fields = self.randomised(np, *(inputs.pop(name) for name in RANDOMISED))
             for name, value in fields.items():
                 per_sim = batch.expand(name)
                 per_sim[:] = value.reshape(per_sim.shape)
@@ -234,7 +243,7 @@ class MjxEngine(Engine):
 
     def load(self, model, data, physics, ctrl):
         """The model with the randomised fields of a simulation, and the data at its state."""
-        fields = self.randomised(jnp, physics.friction, physics.mass_scale)
+        fields = self.randomised(jnp, *(getattr(physics, name) for name in RANDOMISED))
         return model.tree_replace(fields), data.replace(
             qpos=physics.qpos,
             qvel=physics.qvel,

@@ -67,8 +67,7 @@ class Explore(Env):
         return physics.replace(wrench=wrench), push_at
 
     def init_task(self, key, physics, course):
-        feet = jnp.zeros(len(self.robot.feet))
-        return FootClocks(feet, feet, feet)
+        return FootClocks.started(len(self.robot.feet))
 
     def before_rewards(self, task, motion):
         return task.tick(motion.foot_contact, self.dt)

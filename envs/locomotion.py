@@ -1,6 +1,7 @@
 """Velocity tracking on flat ground, blind: anymal_loco, go1_loco, g1_loco (paper Sec. V-A; Isaac Lab's flat tasks).
 
-A command is a forward velocity, a sideways velocity and a heading. The heading error sets the turning rate.
+A command is a forward velocity, a sideways velocity and a heading, whose error sets the turning rate; or, where the
+config asks for it, a turning rate of its own.
 """
 
 from dataclasses import dataclass
@@ -22,10 +23,16 @@ class LocomotionConfig(Config):
     lin_vel_x: Range = (-1.0, 1.0)  # [m/s] forward command
     lin_vel_y: Range = (-1.0, 1.0)  # [m/s] sideways command
     yaw_rate: float = 1.0  # [rad/s] half-width of the turning command
-    command_seconds: float = 10.0  # time between commands
+    command_seconds: Range = (10.0, 10.0)  # time between commands
     standing: float = 0.02  # share of commands to stand still
+    turning: float = 0.0  # share of commands with a turning rate in place of a heading
+    on_the_spot: float = 0.0  # share of commands with a turning rate and no velocity
     fixed_velocity: tuple[float, float] | None = None  # [m/s] forward, sideways with heading 0, in place of commands
+    tracking_seconds: float = 0.0  # [s] time constant of the low-pass on the velocities that the rewards see
     air_time_threshold: float = 0.5  # [s]
+    gait_hz: float = 0.0  # steps per second of each foot, by a clock that the policy sees; 0: no clock
+    stance: float = 0.6  # share of a step for which the clock has a foot stand
+    swing_height: float = 0.08  # [m] to which the clock has it swing
     effort_joints: tuple[str, ...] = ("",)  # parts of the names of joints with torque and acceleration penalties
 
 
@@ -36,6 +43,9 @@ class Task(FootClocks):
     command: jax.Array  # (3,) forward [m/s], sideways [m/s], turning [rad/s], base frame
     heading: jax.Array  # () commanded yaw [rad]
     moves: jax.Array  # () bool: not a command to stand still
+    steers: jax.Array  # () bool: the heading sets the turning rate
+    remaining: jax.Array  # () control steps until the next command
+    velocity: jax.Array  # (3,) low-passed forward, sideways [m/s] and turning [rad/s]
 
 
 class Locomotion(Env):
@@ -53,50 +63,85 @@ class Locomotion(Env):
     COMMAND_RANGES = {"forward [m/s]": (-1.0, 1.0), "sideways [m/s]": (-1.0, 1.0), "turning [rad/s]": (-1.0, 1.0)}
 
     def __init__(self, config, engine="auto"):
+        if config.gait_hz:
+            self.OBS = self.OBS | {"phase": ("phase", 1.0)}
         super().__init__(config, engine)
         self.effort = joint_indices(self.robot, *config.effort_joints)
-        self.command_steps = round(config.command_seconds / self.dt)
+        self.weight = 9.81 * float(self.model.body_mass.sum())  # [N]
 
     def init_task(self, key, physics, course):
-        feet = jnp.zeros(len(self.robot.feet))
-        command, heading, moves = self.draw_command(key)
-        task = Task(feet, feet, feet, command=command, heading=heading, moves=moves)
-        return self.steer(task, self.motion(physics).yaw)
+        motion = self.motion(physics)
+        command = self.draw_command(key)
+        task = Task.started(len(self.robot.feet), velocity=self.tracked_velocity(motion), **command)
+        return self.steer(task, motion.yaw)
 
     def draw_command(self, key):
-        """A new command: velocity (3,), heading () and `moves` ()."""
+        """Fields of Task that hold a new command."""
         c = self.config
+        k_x, k_y, k_heading, k_turn, k_kind, k_stand, k_time = jax.random.split(key, 7)
+        kind, turn = uniform(k_kind, 0.0, 1.0), uniform(k_turn, -c.yaw_rate, c.yaw_rate)
+        on_the_spot, steers = kind < c.on_the_spot, kind >= c.on_the_spot + c.turning
+        velocity = jnp.stack([uniform(k_x, *c.lin_vel_x), uniform(k_y, *c.lin_vel_y)])
+        fields = {
+            "command": jnp.append(jnp.where(on_the_spot, 0.0, velocity), turn),
+            "heading": uniform(k_heading, -jnp.pi, jnp.pi),
+            "moves": uniform(k_stand, 0.0, 1.0) >= c.standing,
+            "steers": steers,
+            "remaining": jnp.round(uniform(k_time, *c.command_seconds) / self.dt).astype(int),
+        }
         if c.fixed_velocity is not None:
-            return jnp.array([*c.fixed_velocity, 0.0]), jnp.zeros(()), jnp.ones((), bool)
-        k_x, k_y, k_heading, k_stand = jax.random.split(key, 4)
-        command = jnp.stack([uniform(k_x, *c.lin_vel_x), uniform(k_y, *c.lin_vel_y), 0.0])
-        return command, uniform(k_heading, -jnp.pi, jnp.pi), uniform(k_stand, 0.0, 1.0) >= c.standing
+            fixed = {"command": jnp.array([*c.fixed_velocity, 0.0]), "heading": jnp.zeros(())}
+            fields |= fixed | {"moves": jnp.ones((), bool), "steers": jnp.ones((), bool)}
+        return fields
 
     def steer(self, task, yaw):
         """Set the turning rate from the heading error, and all velocities to 0 for a command to stand still."""
         turn = jnp.clip(0.5 * wrap(task.heading - yaw), -self.config.yaw_rate, self.config.yaw_rate)
+        turn = jnp.where(task.steers, turn, task.command[2])
         return task.replace(command=jnp.where(task.moves, task.command.at[2].set(turn), 0.0))
 
     def set_command(self, task, command):
-        return task.replace(command=command)
+        """The command holds from now on; no heading and no other command follows."""
+        forever = jnp.full_like(task.remaining, 2**30)
+        yes = jnp.ones_like(task.moves)
+        return task.replace(command=command, moves=yes, steers=~yes, remaining=forever)
+
+    def tracked_velocity(self, motion):
+        """Forward, sideways [m/s] and turning velocity [rad/s] that a command asks for, (3,)."""
+        return jnp.append(motion.lin_vel[:2], motion.ang_vel[2])
 
     def before_rewards(self, task, motion):
-        return task.tick(motion.foot_contact, self.dt)
+        share = min(1.0, self.dt / self.config.tracking_seconds) if self.config.tracking_seconds else 1.0
+        velocity = task.velocity + share * (self.tracked_velocity(motion) - task.velocity)
+        return task.replace(velocity=velocity).tick(motion.foot_contact, self.dt)
 
     def after_rewards(self, key, task, motion, clock):
-        command, heading, moves = self.draw_command(key)
-        due = clock % self.command_steps == 0
-        task = select(due, task.replace(command=command, heading=heading, moves=moves), task)
+        task = task.replace(remaining=task.remaining - 1)
+        task = select(task.remaining <= 0, task.replace(**self.draw_command(key)), task)
         return self.steer(task, motion.yaw)
 
     def task_inputs(self, task, motion, clock):
-        return {"command": task.command}
+        """The command, and sine and cosine of the gait's clock, or zeros while the robot should stand."""
+        if not self.config.gait_hz:
+            return {"command": task.command}
+        angle = 2 * jnp.pi * self.config.gait_hz * clock * self.dt
+        phase = jnp.stack([jnp.sin(angle), jnp.cos(angle)]) * rewards.moving(task.command)
+        return {"command": task.command, "phase": phase}
+
+    def gait(self, command, clock):
+        """What the gait's clock asks of the feet: to stand (F,) bool, and their height (F,) [m]."""
+        swing = 1 - self.config.stance  # a step begins with it
+        share = (self.config.gait_hz * clock * self.dt + jnp.array(self.robot.gait)) % 1.0
+        moves = rewards.moving(command)
+        height = self.config.swing_height * jnp.sin(jnp.pi * jnp.minimum(share / swing, 1.0))
+        return (share >= swing) | ~moves, height * moves
 
     def rewards(self, task, motion, action, last_action, clock):
         m, c = motion, self.config
+        stance, height = self.gait(task.command, clock)
         return {
-            "track_lin_vel": rewards.track_lin_vel(task.command[:2], m.lin_vel[:2]),
-            "track_yaw_rate": rewards.track_yaw_rate(task.command[2], m.ang_vel[2]),
+            "track_lin_vel": rewards.track_lin_vel(task.command[:2], task.velocity[:2]),
+            "track_yaw_rate": rewards.track_yaw_rate(task.command[2], task.velocity[2]),
             "vertical_vel": rewards.square(m.lin_vel[2]),
             "roll_pitch_rate": rewards.square(m.ang_vel[:2]),
             "orientation": rewards.square(m.gravity[:2]),
@@ -105,6 +150,12 @@ class Locomotion(Env):
             "action_rate": rewards.square(action - last_action),
             "air_time": rewards.air_time(task.landed_after, c.air_time_threshold, task.command),
             "slip": rewards.slip(m.foot_vel, m.foot_contact),
+            "in_step": rewards.in_step(m.foot_contact, stance),
+            "foot_path": rewards.foot_path(m.foot_pos[:, 2] - self.robot.sole, height),
+            "impact": rewards.impact(m.foot_force, self.weight),
+            "power": rewards.power(m.torque, m.joint_vel, self.weight),
+            "stand_still": jnp.sum(jnp.abs(m.joint_pos)) * ~rewards.moving(task.command),
+            "stand_on_feet": jnp.sum(~m.foot_contact) * ~rewards.moving(task.command),
             "pose": rewards.square(m.joint_pos),
             "alive": jnp.ones(()),
         }
@@ -129,7 +180,7 @@ class AnymalLocomotion(Locomotion):
 
 
 class G1Locomotion(Locomotion):
-    """G1, with terms for a biped's gait and for joints that should stay near the default pose."""
+    """G1, with terms for joints that should stay near the default pose."""
 
     def __init__(self, config, engine="auto"):
         super().__init__(config, engine)
@@ -142,21 +193,19 @@ class G1Locomotion(Locomotion):
     def rewards(self, task, motion, action, last_action, clock):
         m = motion
         low, high = self.soft_limits
-        # Velocities are tracked in the heading frame: a trunk that leans or pitches loses no reward.
-        upright = axis_angle(jnp.array([0.0, 0, 1]), m.yaw)
-        lin_vel, ang_vel = (rotate(inverse(upright), rotate(m.quat, v)) for v in (m.lin_vel, m.ang_vel))
         ankles = (m.joint_pos + self.default_pose)[self.ankles]
         return super().rewards(task, motion, action, last_action, clock) | {
-            "track_lin_vel": rewards.track_lin_vel(task.command[:2], lin_vel[:2]),
-            "track_yaw_rate": rewards.track_yaw_rate(task.command[2], ang_vel[2]),
-            "flight": rewards.flight(m.foot_contact, task.command),
-            "one_foot": rewards.one_foot(m.foot_contact, task.command),
-            "single_stance": rewards.single_stance(task.air_time, task.contact_time, task.command),
             "ankle_limits": rewards.beyond(ankles, low[self.ankles], high[self.ankles]),
             "hip_deviation": jnp.sum(jnp.abs(m.joint_pos[self.hips])),
             "arm_deviation": jnp.sum(jnp.abs(m.joint_pos[self.arms])),
             "waist_deviation": jnp.sum(jnp.abs(m.joint_pos[self.waist])),
         }
+
+    def tracked_velocity(self, motion):
+        """As in every task, in the heading frame: a trunk that leans or pitches loses no reward."""
+        upright = axis_angle(jnp.array([0.0, 0, 1]), motion.yaw)
+        lin_vel, ang_vel = (rotate(inverse(upright), rotate(motion.quat, v)) for v in (motion.lin_vel, motion.ang_vel))
+        return jnp.append(lin_vel[:2], ang_vel[2])
 
 
 # Deviation (reward weights): Isaac Lab's make every early return negative at CPU batch sizes: robots learn to fall.
@@ -171,22 +220,60 @@ BLIND_QUADRUPED = {
     "gpu": {"total_steps": 29_500_000},
 }
 
+# --robust: what a robot meets and a simulation lacks, and commands as a person gives them. Ours; not in the paper.
+ROBUST = {
+    "spawn_joints": (0.8, 1.2),
+    "spawn_velocity": 0.5,
+    "friction": (0.3, 1.2),
+    "link_mass": (0.9, 1.1),
+    "motor_strength": (0.9, 1.1),
+    "action_delay": (0.0, 0.04),
+    "sensor_lag": (0.0, 0.01),
+    "push_velocity": 1.0,
+    "push_seconds": (4.0, 8.0),
+    "command_seconds": (3.0, 8.0),
+    "standing": 0.1,
+    "turning": 0.3,
+    "on_the_spot": 0.15,
+    "tracking_seconds": 0.1,
+}
+ROBUST_QUADRUPED = ROBUST | {"lin_vel_x": (-1.0, 1.2), "gait_hz": 2.0}
+STEPS = {  # high, even steps with feet that do not slide, and rest where the command is to stand
+    "track_lin_vel": 2.0,
+    "track_yaw_rate": 1.5,
+    "in_step": 1.0,
+    "foot_path": 1.0,
+    "slip": -0.5,
+    "air_time": 0.0,
+    "stand_still": -0.1,
+    "stand_on_feet": -1.0,
+    "alive": 0.5,
+}
+
+ANYMAL_WEIGHTS = {
+    "track_lin_vel": 1.0,
+    "track_yaw_rate": 0.5,
+    "vertical_vel": -2.0,
+    "roll_pitch_rate": -0.0125,
+    "torque": -6.25e-6,
+    "joint_acc": -6.25e-8,
+    "action_rate": -0.01,
+    "air_time": 0.5,
+    "slip": -0.1,
+    "pose": -0.1,
+    "thigh_contact": -1.0,
+    "orientation": -5.0,
+    "alive": 0.25,
+}
+
 ANYMAL_LOCO = LocomotionConfig(
     robot="anymal_d",
-    weights={
-        "track_lin_vel": 1.0,
-        "track_yaw_rate": 0.5,
-        "vertical_vel": -2.0,
-        "roll_pitch_rate": -0.0125,
-        "torque": -6.25e-6,
-        "joint_acc": -6.25e-8,
-        "action_rate": -0.01,
-        "air_time": 0.5,
-        "slip": -0.1,
-        "pose": -0.1,
-        "thigh_contact": -1.0,
-        "orientation": -5.0,
-        "alive": 0.25,
+    weights=ANYMAL_WEIGHTS,
+    robust=ROBUST_QUADRUPED
+    | {
+        "weights": ANYMAL_WEIGHTS | STEPS,
+        "added_mass": (-5.0, 10.0),
+        "joint_friction": (0.0, 0.3),
     },
     ppo=BLIND_QUADRUPED | {"cpu": {"num_envs": 256, "total_steps": 6_000_000}},
     air_time_threshold=0.1,
@@ -196,21 +283,29 @@ ANYMAL_LOCO = LocomotionConfig(
     push_velocity=0.5,
 )
 
+GO1_WEIGHTS = {
+    "track_lin_vel": 1.5,
+    "track_yaw_rate": 0.75,
+    "vertical_vel": -2.0,
+    "roll_pitch_rate": -0.0125,
+    "torque": -5e-5,
+    "joint_acc": -6.25e-8,
+    "action_rate": -0.01,
+    "air_time": 1.0,
+    "slip": -0.1,
+    "pose": -0.1,
+    "orientation": -2.5,
+    "alive": 0.25,
+}
+
 GO1_LOCO = LocomotionConfig(
     robot="go1",
-    weights={
-        "track_lin_vel": 1.5,
-        "track_yaw_rate": 0.75,
-        "vertical_vel": -2.0,
-        "roll_pitch_rate": -0.0125,
-        "torque": -5e-5,
-        "joint_acc": -6.25e-8,
-        "action_rate": -0.01,
-        "air_time": 1.0,
-        "slip": -0.1,
-        "pose": -0.1,
-        "orientation": -2.5,
-        "alive": 0.25,
+    weights=GO1_WEIGHTS,
+    robust=ROBUST_QUADRUPED
+    | {
+        "weights": GO1_WEIGHTS | STEPS,
+        "added_mass": (-1.0, 4.0),
+        "joint_friction": (0.0, 0.3),
     },
     ppo=BLIND_QUADRUPED,
     air_time_threshold=0.1,
@@ -221,26 +316,33 @@ G1_PARTS = ("thigh", "shin", "upperarm", "forearm", "hand")
 
 G1_LOCO = LocomotionConfig(
     robot="g1",
+    robust=ROBUST
+    | {
+        "tracking_seconds": 0.2,
+        "added_mass": (-1.0, 5.0),
+        "joint_friction": (0.0, 0.3),
+        "lin_vel_x": (-0.8, 1.2),
+    },
     weights={
-        "track_lin_vel": 1.0,
-        "track_yaw_rate": 1.0,
-        # Deviation (G1 gait): With Isaac Lab's 0.75 and no flight term it hops on both feet. Without one_foot and
-        # air_time it shuffles on both at once. waist_deviation is -0.1 there, but their G1 cannot bow.
-        "single_stance": 2.0,
-        "one_foot": 0.5,
-        "air_time": 1.0,
-        "flight": -1.0,
-        "slip": -0.1,
+        "track_lin_vel": 1.5,
+        "track_yaw_rate": 1.5,
+        "in_step": 2.0,
+        "foot_path": 1.5,
+        "slip": -0.2,
+        "impact": -0.2,
         "ankle_limits": -1.0,
-        "hip_deviation": -0.1,
-        "arm_deviation": -0.05,
+        "hip_deviation": -0.2,
+        "arm_deviation": -0.1,
         "waist_deviation": -0.5,
+        "stand_still": -0.05,
+        "stand_on_feet": -0.5,
         "vertical_vel": -0.2,
         "roll_pitch_rate": -0.0125,
         "orientation": -1.0,
         "action_rate": -0.0025,
         "joint_acc": -1e-7,
         "torque": -2e-6,
+        "power": -0.1,
         "alive": 0.5,
     },
     ppo={
@@ -250,10 +352,16 @@ G1_LOCO = LocomotionConfig(
         "cpu": {"num_envs": 256, "total_steps": 8_000_000},
         "gpu": {"total_steps": 147_000_000},
     },
-    air_time_threshold=0.1,
     termination_reward=-2.0,
     lin_vel_x=(0.0, 1.0),
     lin_vel_y=(-0.5, 0.5),
+    command_seconds=(3.0, 8.0),
+    standing=0.1,
+    turning=0.4,
+    on_the_spot=0.1,
+    tracking_seconds=0.2,
+    gait_hz=1.5,
+    swing_height=0.1,
     effort_joints=("hip", "knee"),
     # Deviation (G1 contacts): Any part but the feet ends the episode, not the torso alone. Else it learns to sit.
     contact_ends=("torso", "pelvis", *(f"{side}_{part}" for side in ("left", "right") for part in G1_PARTS)),

@@ -21,7 +21,11 @@ from envs.rotations import axis_angle, inverse, rotate, wrap
 HEIGHT_GRID = np.stack(np.meshgrid(np.linspace(-1, 1, 21), np.linspace(-0.5, 0.5, 11), indexing="ij"), -1)  # [m]
 CEILING_GRID = np.stack(np.meshgrid(np.linspace(-1, 1, 11), np.linspace(-0.5, 0.5, 6), indexing="ij"), -1)
 GRIDS = {"height": HEIGHT_GRID, "ceiling": CEILING_GRID}  # kind of a block -> its points (rows, columns, 2)
-SUCCESS_DISTANCE = 0.5  # [m] from the goal when the time is up
+# A robot succeeds if, when the time is up, it is at the goal and stands on its feet.
+SUCCESS_DISTANCE = 0.5  # [m] from the goal
+UPRIGHT_TILT = 25.0  # [deg] of the trunk, less than this
+STANDING_HEIGHT = 0.35  # [m] of the base above the ground under it; in the default pose it is 0.59 m
+FEET_ONLY_SECONDS = 0.2  # for which no other body has touched anything
 
 
 @dataclass(frozen=True)
@@ -56,7 +60,9 @@ class Task:
     shift: jax.Array  # (3,) of the map [m]
     level: jax.Array  # () int
     best: jax.Array  # () highest level solved so far
+    reached: jax.Array  # () highest level drawn so far
     rough: jax.Array  # () bool: rough tiles in place of the obstacle
+    feet_only: jax.Array  # () control steps since a body other than a foot touched something
     foot_vel: jax.Array  # (F, 3) in the last step [m/s]
     foot_acc: jax.Array  # (F, 3) [m/s^2]
 
@@ -72,7 +78,6 @@ class Parkour(Env):
     bootstrap_time_outs = False  # the policy sees the time left, and no reward follows it
     EVALUATION_FIELDS = {"rough": 0.0}
     SHOWCASE_FIELDS = EVALUATION_FIELDS | {"level": 4, "random_seconds": 0.0}
-    FILM_WINDOW = {"start": 0.4, "strip_seconds": 4.0, "gif_seconds": 5.6}
 
     def __init__(self, config, engine="auto"):
         if config.level is not None and not 0 <= config.level < self.LEVELS:
@@ -90,6 +95,10 @@ class Parkour(Env):
         self.collision_sensors = self.engine.sensor(
             *(f"{leg}_{part}_force" for leg in legs for part in ("knee", "shank"))
         )
+        parts = ("thigh", "knee", "shank")
+        self.body_sensors = self.engine.sensor("base_force", *(f"{leg}_{part}_force" for leg in legs for part in parts))
+        seconds = config.episode_seconds - 0.4
+        self.FILM_WINDOW = {"start": 0.4, "strip_seconds": 1.08 * seconds, "gif_seconds": seconds}  # to the very end
         self.torque_limit = jnp.array(self.model.actuator_forcerange[:, 1])
         self.gain = jnp.array(self.model.actuator_gainprm[:, 0])
 
@@ -103,11 +112,11 @@ class Parkour(Env):
 
     def at_level(self, level):
         """Curriculum at a level, with none solved so far."""
-        return {"level": jnp.int32(level), "best": jnp.int32(0)}
+        return {"level": jnp.int32(level), "best": jnp.int32(0), "reached": jnp.int32(level)}
 
     def next_curriculum(self, key, task, motion, terminated, truncated):
         """Up a level after success, down a level after a failure or with more than half of the distance left."""
-        stay = {"level": task.level, "best": task.best}
+        stay = {"level": task.level, "best": task.best, "reached": task.reached}
         if self.config.level is not None:
             return stay
         success = self.succeeded(task, motion, truncated)
@@ -117,12 +126,16 @@ class Parkour(Env):
         moved = {
             "level": jnp.where(level >= self.LEVELS, any_level, jnp.maximum(level, 0)),
             "best": jnp.where(success, jnp.maximum(task.best, task.level), task.best),
+            "reached": jnp.clip(level, task.reached, self.LEVELS - 1),
         }
         return select(task.rough, stay, moved)
 
     def succeeded(self, task, motion, truncated):
-        """True () if the time is up and the robot is at the goal."""
-        return truncated & (self.distance(task, motion) < SUCCESS_DISTANCE)
+        """True () if the time is up and the robot stands on its feet at the goal."""
+        upright = self.tilt(motion) < UPRIGHT_TILT
+        high = self.base_height(motion) >= STANDING_HEIGHT
+        feet_only = task.feet_only >= round(FEET_ONLY_SECONDS / self.dt)
+        return truncated & (self.distance(task, motion) < SUCCESS_DISTANCE) & upright & high & feet_only
 
     def first_clock(self, key):
         return jax.random.randint(key, (), 0, round(self.config.random_seconds / self.dt) + 1)
@@ -159,10 +172,16 @@ class Parkour(Env):
             shift=shift,
             level=course.curriculum["level"],
             best=course.curriculum["best"],
+            reached=course.curriculum["reached"],
             rough=course.rough,
+            feet_only=jnp.int32(0),
             foot_vel=zero,
             foot_acc=zero,
         )
+
+    def markers(self, task):
+        """The goal (1, 3)."""
+        return task.goal[None]
 
     # --- observation ---
 
@@ -218,26 +237,42 @@ class Parkour(Env):
         """Horizontal distance of the base from the goal [m]."""
         return jnp.linalg.norm(task.goal[:2] - motion.base_pos[:2])
 
+    def tilt(self, motion):
+        """Angle of the trunk from level [deg]."""
+        return jnp.rad2deg(jnp.arccos(jnp.clip(-motion.gravity[2], -1.0, 1.0)))
+
+    def base_height(self, motion):
+        """Height of the base above the ground under it [m]."""
+        return motion.base_pos[2] - self.heights(motion.mocap_pos, motion.mocap_quat, motion.base_pos[:2])
+
+    def touching_bodies(self, motion):
+        """Number of bodies other than feet that touch something."""
+        return rewards.touching(motion.sensors[self.body_sensors])
+
     def before_rewards(self, task, motion):
-        return task.replace(foot_vel=motion.foot_vel, foot_acc=(motion.foot_vel - task.foot_vel) / self.dt)
+        feet_only = jnp.where(self.touching_bodies(motion) > 0, 0, task.feet_only + 1)
+        foot_acc = (motion.foot_vel - task.foot_vel) / self.dt
+        return task.replace(feet_only=feet_only, foot_vel=motion.foot_vel, foot_acc=foot_acc)
 
     def rewards(self, task, motion, action, last_action, clock):
         m, distance = motion, self.distance(task, motion)
         turn = jnp.abs(wrap(task.goal_yaw - m.yaw))
         ending = (self.episode_steps - clock - 1) * self.dt < 1.0  # the last second
+        at_goal = ending * (distance < SUCCESS_DISTANCE)
         to_goal = task.goal - m.base_pos
         velocity = rotate(m.quat, m.lin_vel)
         speed = jnp.linalg.norm(velocity)
         towards = jnp.dot(velocity, to_goal) / (jnp.linalg.norm(to_goal) + 0.1)  # [m/s]
-        kp_torque = self.gain * (self.robot.action_scale * action - m.joint_pos)
+        kp_torque = self.gain * (self.action_scale * action - m.joint_pos)
         force = jnp.linalg.norm(m.foot_force, axis=-1)
         sideways = jnp.linalg.norm(m.foot_force[:, :2], axis=-1)
         return {
             "position": ending * jnp.maximum(1 - 0.5 * distance, -1.0),
-            "heading": ending * (distance < 0.5) * (1 - 0.5 * turn),
+            "heading": at_goal * (1 - 0.5 * turn),
             "approach": (distance > 0.25) * jnp.clip(towards, -1.0, 1.0),
             "wait": (distance > 0.25) * (speed < 0.2),
-            "stand": (distance < 0.25) * (turn < 0.5) * jnp.linalg.norm(m.joint_pos),
+            "stand": at_goal * jnp.linalg.norm(m.joint_pos),
+            "on_feet": at_goal * self.on_feet(m),
             "joint_vel": rewards.square(m.joint_vel),
             "torque": rewards.square(m.torque),
             "joint_vel_limit": jnp.sum(jnp.clip(jnp.abs(m.joint_vel) - self.config.velocity_limit, 0.0, 1.0)),
@@ -250,6 +285,15 @@ class Parkour(Env):
             "stumble": jnp.any(sideways > 2 * jnp.abs(m.foot_force[:, 2])),
         }
 
+    def on_feet(self, motion):
+        """Product () of three shares: 1 on the feet as `succeeded` asks, less with tilt, a low base and contacts.
+
+        Each falls off slowly, so that a robot on its knees or nose gains by every correction.
+        """
+        upright = jnp.clip(1.5 - self.tilt(motion) / (2 * UPRIGHT_TILT), 0.0, 1.0)  # 0 from 75 degrees
+        high = jnp.clip(self.base_height(motion) / STANDING_HEIGHT, 0.0, 1.0)
+        return upright * high / (1 + self.touching_bodies(motion))
+
     def failed(self, task, motion):
         c = self.config
         base = jnp.linalg.norm(motion.sensors[self.end_sensors], axis=-1)
@@ -261,7 +305,8 @@ class Parkour(Env):
         return {
             "goal_distance": self.distance(task, motion),  # [m]
             "level": task.level.astype(jnp.float32),
-            "progress": task.best / (self.LEVELS - 1),  # curriculum progress of the paper
+            "progress": task.best / (self.LEVELS - 1),
+            "progress_reached": task.reached / (self.LEVELS - 1),  # curriculum progress of the paper
             "episode_success": self.succeeded(task, motion, truncated).astype(jnp.float32),
         } | {f"level/{i}": (task.level == i).astype(jnp.float32) for i in range(self.LEVELS)}
 
@@ -270,13 +315,16 @@ class Parkour(Env):
 # fifth and bounded. The position term and the total have floors. heading counts within 0.5 m. A failure costs 4, and a
 # tilt of 80 degrees is one. At CPU batch sizes the full penalties teach the robot to stay where it is. action_rate is
 # in units of actions. `approach` pays for metres towards the goal; their cosine between velocity and goal favours
-# creeping.
+# creeping. `stand` and `on_feet` count in the last second within 0.5 m, where success is judged. Their `stand` alone,
+# within 0.25 m at any time, is avoided by stopping farther away, and asks for no feet: after climbing up robots
+# ended on knees or nose.
 WEIGHTS = {
     "position": 10.0,
     "heading": 5.0,
     "approach": 3.0,
     "wait": -1.0,
     "stand": -0.5,
+    "on_feet": 5.0,
     "joint_vel": -0.001,
     "torque": -1e-5,
     "joint_vel_limit": -1.0,

@@ -83,6 +83,10 @@ class Pedipulation(Env):
     def set_command(self, task, command):
         return task.replace(point=command)
 
+    def markers(self, task):
+        """The commanded point (1, 3)."""
+        return task.point[None]
+
     def before_rewards(self, task, motion):
         error = self.foot_error(task, motion)
         return task.replace(error_sum=task.error_sum + error, steps=task.steps + 1)

@@ -14,15 +14,16 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
-from PIL import Image, ImageDraw
+from PIL import Image, ImageDraw, ImageFont
 
 WIDTH, HEIGHT = 320, 240  # [pixels] of one frame
 EVERY = 2  # control steps between frames of a moving picture
 
 
-def film(env, qpos, course, start=4.0, strip_seconds=0.6, strip_frames=10, gif_seconds=4.0):
+def film(env, qpos, course, start=4.0, strip_seconds=0.6, strip_frames=10, gif_seconds=4.0, title="", markers=()):
     """Draw qpos (steps, nq) on a course: rollout.png, a strip of frames, and rollout.gif. Returns name -> bytes.
 
+    Every frame shows its time and the title. `markers` (n, 3) [m] are points of the world that are drawn as spheres.
     Both start after `start` seconds, when the robot has found its pace, or earlier if the rollout is short. By default
     the strip has a frame every 0.06 s, so a stride of 0.3 to 0.45 s appears in five to seven phases.
     """
@@ -32,16 +33,25 @@ def film(env, qpos, course, start=4.0, strip_seconds=0.6, strip_frames=10, gif_s
     strip = first + np.round(np.linspace(0, strip_seconds, strip_frames, endpoint=False) / env.dt).astype(int)
     strip = strip[strip < len(qpos)]
     shown = np.unique(np.concatenate([moving, strip]))
-    images = dict(zip(shown, draw(build(env, course), qpos[shown]), strict=True))
+    images = dict(zip(shown, draw(build(env, course, markers, True), qpos[shown]), strict=True))
+    for i, image in images.items():
+        stamp(image, f"{i * env.dt:.2f} s", title)
 
     sheet = Image.new("RGB", (WIDTH * 5, HEIGHT * -(-len(strip) // 5)), "white")
     for place_in_sheet, i in enumerate(strip):
-        frame = images[i].copy()
-        ImageDraw.Draw(frame).text((6, 4), f"{i * env.dt:.2f} s", fill=(40, 40, 40))
-        sheet.paste(frame, (place_in_sheet % 5 * WIDTH, place_in_sheet // 5 * HEIGHT))
+        sheet.paste(images[i], (place_in_sheet % 5 * WIDTH, place_in_sheet // 5 * HEIGHT))
     png = io.BytesIO()
     sheet.save(png, "PNG", optimize=True)
     return {"rollout.png": png.getvalue(), "rollout.gif": gif_bytes([images[i] for i in moving], env.dt)}
+
+
+def stamp(image, time, title):
+    """Write a time into the upper left corner of an image, and a title into the lower left one."""
+    pen, size = ImageDraw.Draw(image), image.height / 16  # [pixels]
+    font = ImageFont.load_default(size)
+    outlined = {"fill": "white", "stroke_fill": "black", "stroke_width": size / 12, "font": font}
+    pen.text((size / 2, size / 4), time, **outlined)
+    pen.text((size / 2, image.height - size / 2), title, anchor="ls", **outlined)
 
 
 def gif_bytes(images, dt):
@@ -60,10 +70,12 @@ def check_video(path):
         raise ValueError("an MP4 needs the program ffmpeg; install it, or choose a .gif")
 
 
-def video(env, qpos, course, path):
-    """Film a rollout qpos (steps, nq) on a course. Returns the bytes of a GIF or MP4, after the end of `path`."""
+def video(env, qpos, course, path, title="", markers=()):
+    """Film a rollout qpos (steps, nq) as `film` does. Returns the bytes of a GIF or MP4, after the end of `path`."""
     size = (WIDTH, HEIGHT) if path.suffix == ".gif" else (2 * WIDTH, 2 * HEIGHT)  # a GIF grows large
-    images = draw(build(env, course), np.asarray(qpos[::EVERY], np.float64), size)
+    images = draw(build(env, course, markers, True), np.asarray(qpos[::EVERY], np.float64), size)
+    for i, image in enumerate(images):
+        stamp(image, f"{i * EVERY * env.dt:.2f} s", title)
     if path.suffix == ".gif":
         return gif_bytes(images, env.dt)
     width, height = images[0].size
@@ -78,12 +90,19 @@ def video(env, qpos, course, path):
         return mp4.read_bytes()
 
 
-def build(env, course):
-    """MjSpec of an environment's scene, with the obstacles at their places in a course (or a Physics)."""
+def build(env, course, markers=(), close=False):
+    """MjSpec of an environment's scene, with the obstacles at their places in a course (or a Physics).
+
+    Markers (n, 3) [m] are points of the world, such as a goal. `close` zooms in where obstacles keep the camera away.
+    """
     spec = env.scene(visual=True)
     slabs = [body for body in spec.bodies if body.mocap]
     for body, pos, quat in zip(slabs, course.mocap_pos, course.mocap_quat, strict=True):
         body.pos, body.quat = np.asarray(pos, np.float64), np.asarray(quat, np.float64)
+    if close and slabs:
+        spec.camera("track").fovy = 30
+    for point in np.asarray(markers, np.float64):
+        spec.worldbody.add_site(pos=point, size=[0.05, 0, 0], rgba=[0.1, 0.9, 0.9, 0.6])
     return spec
 
 
@@ -145,6 +164,8 @@ def stick_figure(model, data, qpos):
     for geom in np.flatnonzero((model.geom_group == 3) & (model.geom_bodyid > 0)):
         a, b = data.xpos[model.geom_bodyid[geom]], data.geom_xpos[geom]
         ax.plot([a[0], b[0]], [a[2], b[2]], "-", color="tab:red", lw=1)
+    for x, _, z in data.site_xpos[model.site_bodyid == 0]:  # markers
+        ax.plot(x, z, "o", color="tab:cyan", ms=6)
     ax.axhline(0, color="0.6")
     ax.set_xlim(qpos[0] - 0.9, qpos[0] + 0.9)
     ax.set_ylim(-0.1, 1.4)

@@ -43,14 +43,34 @@ def one_foot(contact, command):
     return (jnp.sum(contact) == 1) * moving(command)
 
 
+def in_step(contact, stance):
+    """Share of the feet that are on the ground or off it as the gait's clock asks; contact and stance (F,) bool."""
+    return jnp.mean(contact == stance)
+
+
+def foot_path(height, target):
+    """Gaussian kernel of width 5 cm on the feet's heights above the ground, (F,) each [m]."""
+    return jnp.exp(-jnp.sum((height - target) ** 2) / 0.05**2)
+
+
+def impact(force, weight):
+    """Forces on the feet beyond 1.5 times the robot's weight, in weights; force (F, 3) [N], weight [N]."""
+    return jnp.sum(jnp.maximum(jnp.linalg.norm(force, axis=-1) / weight - 1.5, 0.0))
+
+
+def power(torque, joint_vel, weight):
+    """Mechanical power that the motors give or take, over the weight [m/s]; (A,) [N m], (A,) [rad/s], [N]."""
+    return jnp.sum(jnp.abs(torque * joint_vel)) / weight
+
+
 def flight(contact, command):
     """1 while no foot is on the ground and the command moves: a hop instead of a walk; contact (F,)."""
     return jnp.all(~contact) * moving(command)
 
 
 def moving(command):
-    """1 if the command asks for more than 0.1 m/s, else 0, so that standing still needs no steps."""
-    return jnp.linalg.norm(command[:2]) > 0.1
+    """1 if the command asks for more than 0.1 m/s or 0.1 rad/s, else 0, so that standing still needs no steps."""
+    return (jnp.linalg.norm(command[:2]) > 0.1) | (jnp.abs(command[2]) > 0.1)
 
 
 def slip(foot_vel, contact):

@@ -25,8 +25,9 @@ class Robot:
     joints: tuple[str, ...]
     axes: str  # (A,) letters x, y or z: axis of each joint in the base frame at q = 0
     default_pose: tuple[float, ...]  # (A,) [rad] joint targets of action zero
-    action_scale: float  # [rad] change of the joint target per unit of action
+    action_scale: tuple[float, ...]  # (A,) [rad] change of the joint target per unit of action
     feet: tuple[str, ...]  # (F,) sites; sensors <foot>_pos, <foot>_vel and <foot>_force
+    gait: tuple[float, ...]  # (F,) share of a step by which a foot is ahead; every mirror image is half a step ahead
     sole: float  # [m] height of a foot's site above the ground it stands on
     mirrors: dict[str, dict[str, str]]  # symmetry -> first part of a name -> its image
 
@@ -64,8 +65,9 @@ ANYMAL_D = Robot(
     joints=tuple(f"{leg}_{joint}" for leg in ("LF", "RF", "LH", "RH") for joint in ("HAA", "HFE", "KFE")),
     axes="xyy" * 4,
     default_pose=(0.0, 0.4, -0.8) * 2 + (0.0, -0.4, 0.8) * 2,
-    action_scale=0.5,
+    action_scale=(0.5,) * 12,
     feet=("LF_foot", "RF_foot", "LH_foot", "RH_foot"),
+    gait=(0.0, 0.5, 0.5, 0.0),
     sole=0.031455,
     mirrors={
         "left_right": pairs("LF", "RF", "LH", "RH"),
@@ -80,8 +82,9 @@ GO1 = Robot(
     joints=tuple(f"{leg}_{joint}_joint" for leg in ("FR", "FL", "RR", "RL") for joint in ("hip", "thigh", "calf")),
     axes="xyy" * 4,
     default_pose=(0.0, 0.9, -1.8) * 4,
-    action_scale=0.25,
+    action_scale=(0.25,) * 12,
     feet=("FR_foot", "FL_foot", "RR_foot", "RL_foot"),
+    gait=(0.0, 0.5, 0.5, 0.0),
     sole=0.023,
     mirrors={"left_right": pairs("FR", "FL", "RR", "RL")},
 )
@@ -89,6 +92,14 @@ GO1 = Robot(
 G1_LEG = ("hip_pitch", "hip_roll", "hip_yaw", "knee", "ankle_pitch", "ankle_roll")
 G1_WAIST = ("waist_yaw", "waist_roll", "waist_pitch")
 G1_ARM = ("shoulder_pitch", "shoulder_roll", "shoulder_yaw", "elbow", "wrist_roll", "wrist_pitch", "wrist_yaw")
+
+# Deviation (G1 action scale): Isaac Lab's is 0.5 for every joint, which asks arms for 1.5 times their torque limit per
+# unit of action. As in mjlab a unit asks for a quarter of the limit, 0.25 limit / kp, but never for more than 0.5 rad.
+G1_SCALE = (
+    *(0.293, 0.463, 0.293, 0.463, 0.5, 0.5) * 2,
+    *(0.293, 0.167, 0.167),
+    *(0.083, 0.083, 0.083, 0.083, 0.5, 0.5, 0.5) * 2,
+)
 
 # Pose: MuJoCo Playground's "knees bent".
 G1 = Robot(
@@ -105,8 +116,9 @@ G1 = Robot(
         *(0.2, 0.2, 0.0, 0.6, 0.0, 0.0, 0.0),
         *(0.2, -0.2, 0.0, 0.6, 0.0, 0.0, 0.0),
     ),
-    action_scale=0.5,
+    action_scale=G1_SCALE,
     feet=("left_foot", "right_foot"),
+    gait=(0.0, 0.5),
     sole=0.0,
     mirrors={"left_right": pairs("left", "right")},
 )

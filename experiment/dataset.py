@@ -85,7 +85,7 @@ def finish(folder, arrays, args, env, iterations, held_out):
         "transitions": iterations * args.num_steps * args.num_envs,
         "validation_envs": list(range(args.num_envs - held_out, args.num_envs)),
         "history": env.config.history,
-        "action_scale": env.robot.action_scale,
+        "action_scale": list(env.robot.action_scale),
         "dt": env.dt,
         "args": dataclasses.asdict(args),
         "config": dataclasses.asdict(env.config),

@@ -63,6 +63,6 @@ def of_first_episodes(metrics, alive, ended):
     for name, value in metrics.items():
         if name.startswith(EPISODE):
             result[name] = (value * ended).sum() / ended.sum()
-        elif "/" not in name and name != "progress":  # progress is of a whole training
+        elif "/" not in name and not name.startswith("progress"):  # progress is of a whole training
             result[name] = (value * alive).sum() / alive.sum()
     return result

@@ -84,7 +84,7 @@ def stepping(task, engine, num_envs, whole):
     actions = jax.random.normal(jax.random.key(1), (length, num_envs, env.action_dim))
     step, carry, inputs = jax.vmap(env.step), state, actions
     if not whole:
-        targets = env.default_pose + env.robot.action_scale * actions
+        targets = env.default_pose + env.action_scale * actions
         step, carry, inputs = jax.vmap(env.engine.step), state.physics, targets
     speed, compile_s = rate(
         lambda c, inputs: jax.lax.scan(lambda s, a: (step(s, a), None), c, inputs)[0], carry, inputs, num_envs * length
@@ -185,7 +185,7 @@ def solver(task, limit, num_envs=64):
         model = copy.copy(env.model)
         model.opt.iterations = model.opt.ls_iterations = iterations
         rows = []
-        for i, target in enumerate(np.asarray(env.default_pose + env.robot.action_scale * actions[-1])):
+        for i, target in enumerate(np.asarray(env.default_pose + env.action_scale * actions[-1])):
             data = mujoco.MjData(model)
             data.qpos[:], data.qvel[:], data.ctrl[:] = physics.qpos[i], physics.qvel[i], target
             data.mocap_pos[:], data.mocap_quat[:] = physics.mocap_pos[i], physics.mocap_quat[i]

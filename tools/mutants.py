@@ -152,6 +152,20 @@ FAULTS = {  # (file, tests, words for -k) -> faults: name, old text, new text
     ("envs/parkour.py", "test_parkour", "promotion"): [
         ("a level is never lost", "task.level + success - failure", "task.level + success"),
     ],
+    ("envs/parkour.py", "test_parkour", "success_is_to_stand"): [
+        ("success nose-down", "upright = self.tilt(motion) < UPRIGHT_TILT", "upright = True"),
+        (
+            "height above the floor, not the box",
+            "motion.base_pos[2] - self.heights(",
+            "motion.base_pos[2] - 0 * self.heights(",
+        ),
+    ],
+    ("envs/parkour.py", "test_parkour", "starts_again_at_a_touch"): [
+        ("knees may touch", "jnp.where(self.touching_bodies(motion) > 0, 0,", "jnp.where(False, 0,"),
+    ],
+    ("envs/parkour.py", "test_parkour", "parkour_rewards"): [
+        ("a stand term that is avoided at 0.26 m", '"stand": at_goal', '"stand": (distance < 0.25)'),
+    ],
     ("envs/pedipulation.py", "test_parkour", "pedipulation_target"): [
         ("a point seen from a frame turned twice", "inverse(motion.quat), task.point", "motion.quat, task.point"),
     ],

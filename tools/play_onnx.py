@@ -74,7 +74,6 @@ class Player:
         self.set_gains()
         self.data = mujoco.MjData(self.model)
         self.decimation = round(self.facts["dt"] / self.model.opt.timestep)
-        self.history = None
         self.stand()
 
     def set_gains(self):
@@ -95,11 +94,13 @@ class Player:
         solid = [i for i in range(m.ngeom) if m.geom_contype[i] and m.geom_type[i] == mujoco.mjtGeom.mjGEOM_SPHERE]
         d.qpos[2] -= min(d.geom_xpos[i, 2] - m.geom_size[i, 0] for i in solid)
         mujoco.mj_forward(m, d)
-        self.history = None
+        self.history, self.seconds = None, 0.0
 
     def readings(self, command):
         """Inputs of the policy by name, in SI units and the base frame."""
         d, turn = self.data, np.zeros(9)
+        angle = 2 * np.pi * self.facts.get("gait_hz", 0.0) * self.seconds
+        moves = np.hypot(*command[:2]) > 0.1 or abs(command[2]) > 0.1
         mujoco.mju_quat2Mat(turn, d.qpos[3:7])
         down = turn.reshape(3, 3).T
         return {
@@ -109,6 +110,7 @@ class Player:
             "command": np.asarray(command),
             "joint_pos": d.qpos[7:],
             "joint_vel": d.qvel[6:],
+            "phase": np.array([np.sin(angle), np.cos(angle)]) * moves,  # of policies with a gait clock
         }
 
     def step(self, command):
@@ -122,6 +124,7 @@ class Player:
         feed = {name: np.float32(values[name])[None] for name in self.shapes}
         action, target, prop, past = (out[0] for out in self.session.run(None, feed))
         self.history = {"prop_history": prop, "action_history": past}
+        self.seconds += self.facts["dt"]
         self.data.ctrl[:] = target
         for _ in range(self.decimation):
             mujoco.mj_step(self.model, self.data)

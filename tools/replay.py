@@ -46,7 +46,7 @@ def trace(args, env, net, state):
     def step(before, action):
         after = jax.vmap(env.step)(before, action)
         sound = jnp.isfinite(after.reward) & jnp.isfinite(action).all(-1) & jnp.isfinite(after.final_obs).all(-1)
-        physics, target = before.physics, env.default_pose + env.robot.action_scale * action
+        physics, target = before.physics, env.default_pose + env.action_scale * action
         return after, (physics.qpos, physics.qvel, target, ~sound | after.metrics["diverged"])
 
     return jax.lax.scan(step, state.env, roll.action)[1]
@@ -55,7 +55,7 @@ def trace(args, env, net, state):
 def find(folder, iterations, robots):
     """Write nan.npz and print what failed. UserError if the folder is no run that can be resumed."""
     args = records.resumed(ppo_finetune.Args(resume=str(folder)))
-    env = make_env(envs.make, args.task, args)
+    env = make_env(partial(envs.make, robust=args.robust), args.task, args)
     args = ppo_finetune.merge(args, env.config.ppo)
     net, opt = ppo_finetune.make_net(args, env), optax.scale_by_adam()
     like = jax.eval_shape(partial(ppo_finetune.init_state, args, env, net, opt))
@@ -88,7 +88,7 @@ def repeat(path):
         with np.load(path, allow_pickle=False) as file:
             dump = {name: file[name] for name in ("qpos", "qvel", "ctrl", "environment", "task", "set")}
         args = ppo_finetune.Args(task=str(dump["task"]), engine="c", set=tuple(dump["set"].tolist()))
-        env = make_env(envs.make, args.task, args)
+        env = make_env(partial(envs.make, robust=args.robust), args.task, args)
         if dump["qpos"].shape[2:] != (env.model.nq,) or dump["ctrl"].shape[2:] != (env.model.nu,):
             raise ValueError("its shapes are not those of its task")
     except Exception as error:  # numpy has no common class for what can be wrong with a file
