@@ -70,3 +70,24 @@ TASKS = {  # in the paper's order
     "go1_loco": Task("Go1 locomotion", (*TABLE_1, *ORTHOGONAL, "pidm_shuffled"), 6_000_000),
     "g1_loco": Task("G1 locomotion", (*TABLE_1, "pidm_shuffled"), 12_000_000),
 }
+
+# Fields that the config of an older run lacks, at the values that leave its task as it was.
+LATER = {
+    "motor_strength": [1.0, 1.0],
+    "joint_friction": [0.0, 0.0],
+    "action_delay": [0.0, 0.0],
+    "sensor_lag": [0.0, 0.0],
+    "turning": 0.0,
+    "on_the_spot": 0.0,
+    "tracking_seconds": 0.0,
+    "gait_hz": 0.0,
+}
+CLOCK = ("stance", "swing_height")  # of the gait's clock, read only if there is one
+
+
+def task_of(config):
+    """A run's config as args.json has it, in a form in which runs of the same task are equal, whatever their age."""
+    task = {name: value for name, value in (LATER | config).items() if name != "robust"}  # what --robust would set
+    if isinstance(seconds := task.get("command_seconds"), float):
+        task["command_seconds"] = [seconds, seconds]
+    return {name: value for name, value in task.items() if task["gait_hz"] or name not in CLOCK}

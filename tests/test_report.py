@@ -1,47 +1,235 @@
 """The report's measures on curves with answers known by hand, and runs that it must leave out."""
 
+import csv
 import json
+import re
 import shutil
+import statistics
 
 import numpy as np
 import pytest
 
 from experiment import records
-from results import pidm, report, tasks
+from results import drawing, measures, pidm, report, tasks
 from tools import bench
 
 
-def curve(values):
-    return {"iteration": np.arange(1.0, len(values) + 1), "indicator": np.asarray(values, float)}
+def curve(values, seed=0):
+    return {"iteration": np.arange(1.0, len(values) + 1), "indicator": np.asarray(values, float), "seed": seed}
+
+
+def flat(*levels):
+    """Runs of ten rows at these levels, seeds 0, 1, ..."""
+    return [curve([level] * 10, seed) for seed, level in enumerate(levels)]
+
+
+# --- Measures ---
 
 
 def test_final_is_the_mean_of_the_last_twentieth():
-    assert report.final(curve([*[0.0] * 38, 4.0, 6.0])) == 5.0
-    assert report.final(curve([1.0, 2.0])) == 2.0
+    assert measures.final(curve([*[0.0] * 38, 4.0, 6.0])) == 5.0
+    assert measures.final(curve([1.0, 2.0])) == 2.0
 
 
 def test_late_gain_is_what_the_last_third_brought():
-    assert report.late_gain(curve([*[1.0] * 20, *[8.0] * 20, *[10.0] * 20])) == pytest.approx(0.2)
-    assert report.late_gain(curve([3.0])) == 0.0
+    assert measures.late_gain(curve([*[1.0] * 20, *[8.0] * 20, *[10.0] * 20])) == pytest.approx(0.2)
+    assert measures.late_gain(curve([3.0])) == 0.0
 
 
-def test_iterations_to_a_level():
-    """Rises 1 an iteration: the mean of five rows that ends at iteration i is i - 2."""
+def test_iterations_to_a_level_are_of_raw_rows_or_of_a_trailing_mean():
+    """A run rises 1 an iteration, with one noisy row of 30 at iteration 3: raw rows see it, means of five do later."""
     rising = curve(np.arange(1.0, 41.0))
-    assert report.iterations_to(rising, 10.0) == 12
-    assert np.isnan(report.iterations_to(rising, 100.0))
+    assert measures.iterations_to(rising, 10.0) == 10
+    assert measures.iterations_to(rising, 10.0, rows=5) == 12  # the mean of five that ends at i is i - 2
+    assert np.isnan(measures.iterations_to(rising, 100.0))
+    rising["indicator"][2] = 30.0
+    assert measures.iterations_to(rising, 10.0) == 3
+    assert measures.iterations_to(rising, 10.0, rows=5) == 7
+    rising["indicator"][0] = np.nan  # no episode had ended
+    assert measures.iterations_to(rising, np.array([2.0, 31.0, 99.0])).tolist()[:2] == [2, 31]
 
 
-def test_interval_by_hand():
-    assert report.interval(*report.percent([11.0, 11.0], [10.0, 10.0])) == "+10.0"
-    assert report.interval(*report.percent([5.0], [10.0])) == "-50.0"
-    low, high = report.interval(*report.percent([8.0, 12.0], [10.0, 10.0])).split("[")[1].rstrip("]").split(", ")
-    assert (float(low), float(high)) == (-20.0, 20.0)
+def test_the_goal_is_of_the_runs_that_are_drawn():
+    """PIDM random ends at 10 or 20, so that 90% is 9 or 18: a run that rises 1 an iteration is there at 9 or 18.
+
+    Catches a goal of all seeds for every draw, which is 13.5 and gives 14 both times.
+    """
+    rising = [curve(np.arange(1.0, 41.0))] * 2
+    steps = np.arange(1.0, 41.0)
+    baseline = [curve(np.minimum(steps, 10.0)), curve(np.minimum(steps, 20.0))]
+    both, first, second = (np.array([drawn]) for drawn in ([0, 1], [0, 0], [1, 1]))
+    runs = rising + baseline
+    for drawn, goal in ((first, 9), (second, 18)):
+        assert measures.values("to 90%", runs, np.array([goal / 0.9]))[0, 0] == goal
+        assert measures.change("to 90%", rising, baseline, both, drawn) == 0.0
+    mixed = measures.change(
+        "to 90%", rising, baseline, both, both
+    )  # 14 against 14 and, for the one that ends at 10, 40
+    assert mixed == pytest.approx(100 * (14 / 27 - 1))
 
 
-def test_a_single_seed_has_no_std():
+def test_what_was_not_run_or_not_reached_is_said():
+    runs = {"pidm_random": flat(10.0), "mlp": flat(10.0, 1.0)}
+    assert str(measures.compare("t", runs, "mlp", "to 90%")) == "≥ +450.0"  # iteration 1, and 10 for never
+    assert str(measures.compare("t", runs, "mlp", "final")) == "-45.0"
+    assert report.shown(measures.compare("t", runs, "pidm_pretrained", "final")) == "not run"
+    assert report.shown(measures.compare("t", {}, "mlp", "final")) == "not run"
+    runs = {"pidm_random": flat(1.0, 9.0), "mlp": flat(10.0)}
+    assert str(measures.compare("t", runs, "mlp", "to 90%")) == "≤ -81.8"  # 1 against 1 and 10
+    assert str(measures.compare("t", runs | {"mlp": flat(2.0)}, "mlp", "to 90%")) == "~ +81.8"
+
+
+# --- Intervals ---
+
+
+def test_bca_interval_is_efrons(monkeypatch):
+    """Against the formula of Efron (1987), with an independent bootstrap of a skewed sample at the same level.
+
+    Catches a percentile interval, whose upper end is lower by a tenth of the width.
+    """
+    x = np.array([1.0, 1.1, 1.2, 1.3, 1.5, 1.7, 1.9, 2.1, 2.2, 3.0, 4.0, 6.0])
+    monkeypatch.setattr(measures, "DRAWS", 200_000)
+    low, high = measures.interval(lambda i, axis=-1: x[i].mean(-1), [np.arange(len(x))], "a task")
+    draws = np.random.default_rng(5).choice(x, (200_000, len(x))).mean(1)
+    normal = statistics.NormalDist()
+    bias = normal.inv_cdf(((draws < x.mean()).mean() + (draws <= x.mean()).mean()) / 2)
+    left = np.array([np.delete(x, k).mean() for k in range(len(x))])
+    acceleration = np.sum((left.mean() - left) ** 3) / (6 * np.sum((left.mean() - left) ** 2) ** 1.5)
+    tail = (1 - measures.level([len(x)])) / 2
+    expected = []
+    for z in (normal.inv_cdf(tail), normal.inv_cdf(1 - tail)):
+        share = normal.cdf(bias + (bias + z) / (1 - acceleration * (bias + z)))
+        expected.append(np.quantile(draws, share))
+    plain = np.quantile(draws, (tail, 1 - tail))
+    width = expected[1] - expected[0]
+    assert [low, high] == pytest.approx(expected, abs=0.03 * width)
+    assert plain[1] < expected[1] - 0.1 * width
+
+
+def test_level_makes_normal_intervals_as_wide_as_students():
+    """Five values: t with 4 degrees is 2.776; five and five: 2.306 with 8. A resample has 4/5 of the variance."""
+    for sizes, t in (([5], 2.7764), ([5, 5], 2.3060)):
+        z = statistics.NormalDist().inv_cdf((1 + measures.level(sizes)) / 2)
+        assert z * np.sqrt(4 / 5) == pytest.approx(t, abs=1e-3)
+
+
+def test_intervals_cover_what_they_say(monkeypatch):
+    """400 studies of five seeds in two arms that are alike: zero is inside 95%. Plain bootstraps cover 88%."""
+    monkeypatch.setattr(measures, "DRAWS", 999)
+    rng, inside = np.random.default_rng(3), 0
+    for study in range(400):
+        a, b = rng.normal(1.0, 0.05, (2, 5))
+
+        def statistic(i, j, axis=-1, a=a, b=b):
+            return a[i].mean(-1) / b[j].mean(-1) - 1
+
+        low, high = measures.interval(statistic, [np.arange(5)] * 2, str(study))
+        inside += low <= 0 <= high
+    assert 0.925 <= inside / 400 <= 0.98
+
+
+def test_intervals_begin_at_two_seeds():
+    """One seed of a method has no interval, even beside five of PIDM random."""
+    runs = {"pidm_random": flat(9.0, 10.0, 11.0, 9.5, 10.5), "mlp": flat(11.0)}
+    assert str(measures.compare("t", runs, "mlp", "final")) == "+10.0"
+    assert str(measures.compare("t", runs | {"mlp": flat(11.0, 11.5)}, "mlp", "final")).startswith("+12.5 [")
+    same = {"pidm_random": flat(10.0, 10.0), "mlp": flat(11.0, 11.0)}
+    assert str(measures.compare("t", same, "mlp", "final")) == "+10.0"  # nothing varies
+
+
+def test_tasks_are_drawn_independently():
+    """Two tasks with the same numbers: the mean's interval is narrower by the root of two than that of one.
+
+    Catches the same seed indices for all tasks of a size, whose mean is as wide as each. Student's t is 2.306 with 8
+    degrees of freedom and 2.120 with 16.
+    """
+    runs = {"pidm_random": flat(9.0, 10.0, 11.0, 9.5, 10.5), "mlp": flat(11.0, 11.5, 12.0, 10.0, 10.5)}
+    one = measures.compare("a", runs, "mlp", "final").interval
+    two = measures.mean_over_seeds({"a": runs, "b": runs}, "mlp", "final").interval
+    assert np.ptp(two) / np.ptp(one) == pytest.approx(np.sqrt(0.5) * 2.120 / 2.306, rel=0.08)
+    assert measures.compare("b", runs, "mlp", "final").interval != one
+
+
+# --- Over tasks ---
+
+
+def test_means_over_tasks():
+    """Tasks at +10 and -30 percent with two seeds, one at +890 with one; one has no baseline."""
+    study = {
+        "go1_loco": {"pidm_random": flat(10.0, 10.0), "mlp": flat(11.0, 11.0)},
+        "g1_loco": {"pidm_random": flat(10.0, 10.0), "mlp": flat(7.0, 7.0)},
+        "anymal_climb_up": {"pidm_random": flat(10.0), "mlp": flat(99.0)},
+        "anymal_loco": {"mlp": flat(10.0, 10.0)},
+    }
+    assert str(measures.mean_over_seeds(study, "mlp", "final")) == "-10.0"
+    assert measures.mean_over_tasks(study, "mlp", "final").value == pytest.approx(870 / 3)
+    every, several = (line.split(" | ") for line in report.table_1(study)[-2:])
+    assert every[2].startswith("+290.0 [") and every[3] == "-1.1"  # the paper: +0.6, -0.2 and -3.7
+    assert several[2:4] == ["-10.0", "+0.2"] and several[4:6] == ["not run", ""]
+
+
+def test_mean_counts_a_run_that_never_got_there_by_its_length():
+    """PIDM random is there at row 1, as are the MLPs of one task; the other's are not at row 10: +0, at least +900."""
+    study = {
+        "go1_loco": {"pidm_random": flat(10.0, 10.0), "mlp": flat(10.0, 10.0)},
+        "g1_loco": {"pidm_random": flat(10.0, 10.0), "mlp": flat(1.0, 1.0)},
+    }
+    assert str(measures.mean_over_seeds(study, "mlp", "to 90%")) == "≥ +450.0"
+    assert str(measures.mean_over_seeds({"go1_loco": study["go1_loco"]}, "mlp", "to 90%")) == "+0.0"
+    assert str(measures.mean_over_tasks(study, "mlp", "to 90%")).startswith("≥ +450.0")
+
+
+def test_interquartile_mean_is_of_the_middle_half_of_runs():
+    """Runs at +0, +10, +20, +90%: the middle two. Then a task of one run at +40% beside one of +0 and +20%.
+
+    It weighs as much as both: +0, +20, +40, +40, the middle two again. Catches a task that weighs by its seeds.
+    """
+    study = {
+        "go1_loco": {"pidm_random": flat(10.0), "mlp": flat(10.0, 19.0)},
+        "g1_loco": {"pidm_random": flat(100.0), "mlp": flat(110.0, 120.0)},
+    }
+    assert measures.interquartile_mean(study, "mlp", "final").value == pytest.approx(15.0)
+    study = {
+        "go1_loco": {"pidm_random": flat(10.0), "mlp": flat(14.0)},
+        "g1_loco": {"pidm_random": flat(10.0), "mlp": flat(10.0, 12.0)},
+    }
+    assert measures.interquartile_mean(study, "mlp", "final").value == pytest.approx(30.0)
+
+
+def test_improvement_pairs_runs_by_seed():
+    """Seeds stand in another order and one has no partner: seed 0 loses, seed 1 ties, seed 2 wins.
+
+    Catches pairs by position, of which none ties.
+    """
+    arm = [curve([3.0] * 10, 2), curve([1.0] * 10, 0), curve([5.0] * 10, 1), curve([99.0] * 10, 7)]
+    runs = {"pidm_random": flat(2.0, 5.0, 1.0), "mlp": arm}
+    assert sorted(measures.better("final", arm, runs["pidm_random"])) == [0.0, 0.5, 1.0]
+    assert report.wins(runs, "mlp", "final") == "1.5 of 3"
+    strangers = {"pidm_random": [curve([1.0] * 10, 8)], "mlp": arm}  # no seed in common: no pair, and no part in a mean
+    assert measures.improvement({"go1_loco": runs, "g1_loco": strangers}, "mlp", "final").value == 50.0
+    assert measures.improvement({"g1_loco": strangers}, "mlp", "final") is None
+    assert measures.improvement({"go1_loco": runs}, "mlp", "final").value == 50.0
+    slow, fast = [curve([*[0.0] * 5, *[9.0] * 5])], [curve([9.0] * 10)]
+    assert measures.better("to 90%", fast, slow) == [1.0]  # fewer iterations are better
+
+
+def test_controls_compare_the_same_seeds():
+    """Seed 2 of the baseline, which the control lacks, would make the change -45%."""
+    runs = {"pidm_random": flat(10.0, 10.0, 40.0), "pidm_shuffled": flat(11.0, 11.0)}
+    arms = measures.same_seeds(runs, "pidm_shuffled", "pidm_random")
+    assert [len(arm) for arm in arms.values()] == [2, 2]
+    line = report.controls({"go1_loco": runs})[-1].split(" | ")
+    assert line[1:5] == ["PIDM shuffled", "PIDM random", "0, 1", "+10.0"]
+    assert measures.same_seeds(runs, "pidm_shuffled", "mlp") == {}
+
+
+# --- Tables ---
+
+
+def test_spread_is_the_std_of_a_sample():
+    """9 and 11: the std is the root of 2 with ddof 1; with ddof 0 it is 1."""
     assert report.spread([12.5]) == "12.5"
-    assert report.spread([9.0, 11.0]) == "10 ± 1"
+    assert report.spread([9.0, 11.0]) == "10 ± 1.4"
 
 
 def test_counts_say_how_many_got_there():
@@ -50,42 +238,19 @@ def test_counts_say_how_many_got_there():
     assert report.counts([np.nan]) == "not reached"
 
 
-def test_what_was_not_run_or_not_reached_is_said():
-    runs = {"pidm_random": [curve([10.0] * 10)], "mlp": [curve([10.0] * 10), curve([1.0] * 10)]}
-    assert report.cell(runs, "mlp", "to 90%") == "not reached by 1 of 2"
-    assert report.cell(runs, "mlp", "final").startswith("-45.0 [-90.0, ")
-    assert report.cell(runs, "pidm_pretrained", "final") == "not run"
-    assert report.cell({}, "mlp", "final") == "not run"
-    runs = {"pidm_random": [curve([1.0] * 10), curve([9.0] * 10)], "mlp": [curve([10.0] * 10)]}
-    assert report.cell(runs, "mlp", "to 90%") == "not reached by 1 of 2 PIDM random"
+def test_updates_are_of_the_first_iterations_and_also_per_step_size():
+    """Pretrained moves half as much at a quarter of the step size, so twice as much per unit; later rows differ."""
+
+    def run(scale, step):
+        iteration = np.array([50.0, 100.0, 150.0])
+        columns = {f"update/actor/{module}": scale * np.array([1.0, 3.0, 99.0 / scale]) for module in drawing.MODULES}
+        return {"iteration": iteration, "columns": columns | {"lr": step * np.array([1.0, 1.0, 7.0 / step])}}
+
+    table = report.updates_table({"go1_loco": {"pidm_random": [run(1.0, 4.0)], "pidm_pretrained": [run(0.5, 1.0)]}})
+    assert table[-1] == "| Go1 locomotion | 1 | -50 | -50 | -50 | -50 | -75 | +100 |"
 
 
-def test_mean_over_tasks_is_of_those_with_several_seeds():
-    """Two tasks at +10 and -30 percent; one has a single seed of each, one a single seed of one, one no baseline."""
-    ten = curve([10.0] * 10)
-    study = {
-        "go1_loco": {"pidm_random": [ten, ten], "mlp": [curve([11.0] * 10)] * 2},
-        "g1_loco": {"pidm_random": [ten, ten], "mlp": [curve([7.0] * 10)] * 2},
-        "anymal_climb_up": {"pidm_random": [ten], "mlp": [curve([99.0] * 10)]},
-        "anymal_crouch": {"pidm_random": [ten, ten], "mlp": [curve([99.0] * 10)]},
-        "anymal_loco": {"mlp": [ten, ten]},
-    }
-    line = report.table_1(study)[-1].split(" | ")
-    assert line[2:4] == ["-10.0", "+0.2"] and line[4:6] == ["not run", ""]
-    assert report.cell(study["anymal_climb_up"], "mlp", "final") == "+890.0"
-
-
-def test_mean_counts_a_run_that_never_got_there_by_its_length():
-    """PIDM random is there at row 5, as are the MLPs of one task; the other's are not at row 10: +0, at least +100."""
-    ten = curve([10.0] * 10)
-    study = {
-        "go1_loco": {"pidm_random": [ten, ten], "mlp": [ten, ten]},
-        "g1_loco": {"pidm_random": [ten, ten], "mlp": [curve([1.0] * 10)] * 2},
-    }
-    assert report.cell(study["g1_loco"], "mlp", "to 90%") == "not reached by 2 of 2"
-    text, tasks = report.mean_over_tasks(study, "mlp", "to 90%")
-    assert text == "at least +50.0" and list(tasks) == ["go1_loco", "g1_loco"]
-    assert report.mean_over_tasks({"go1_loco": study["go1_loco"]}, "mlp", "to 90%")[0] == "+0.0"
+# --- Pages ---
 
 
 def test_the_paper_s_means_are_those_it_prints():
@@ -97,6 +262,46 @@ def test_the_paper_s_means_are_those_it_prints():
 
 def test_pages_are_what_the_runs_give():
     report.main(report.Args(check=True))
+    assert len((report.ROOT / "results/README.md").read_text().splitlines()) <= 250
+
+
+def test_only_marked_places_are_filled():
+    text = "a\n<!-- results/report.py writes table 1 from here -->\nold\n<!-- to here -->\nb\n"
+    text += "<!-- results/report.py writes from here -->\n<!-- to here -->\n"
+    page = report.filled(text, {"table 1": ["| x |"], "": ["| y |"]})
+    assert re.sub(r"<!--.*?-->\n", "", page).split() == ["a", "|", "x", "|", "b", "|", "y", "|"]
+    assert report.filled(page, {"table 1": ["| x |"], "": ["| y |"]}) == page
+
+
+def recorded(task, method):
+    """Indicator (K, R) of recorded runs, read from their rows; a reference that shares nothing with the report."""
+    curves = []
+    for path in sorted((report.ROOT / "results/study/cpu" / task / method).glob("seed*/metrics.csv")):
+        with path.open() as file:
+            rows = list(csv.DictReader(file))
+        curves.append([float(row["progress" if "progress" in rows[0] else "episode_return"]) for row in rows])
+    return np.array(curves)
+
+
+def test_words_of_the_page_are_what_was_recorded():
+    """Main numbers of the text, which is written by hand, from the rows alone."""
+    text = " ".join((report.ROOT / "results/README.md").read_text().split())
+    ends, there = [], []
+    for task in report.TASKS:
+        arms = [recorded(task, method) for method in ("pidm_pretrained", "pidm_random")]
+        final = [arm[:, -max(arm.shape[1] // 20, 1) :].mean() for arm in arms]
+        first = [np.mean([1 + np.flatnonzero(run >= 0.9 * final[1])[0] for run in arm]) for arm in arms]
+        ends.append(100 * (final[0] / final[1] - 1))
+        there.append(100 * (first[0] / first[1] - 1))
+    assert f"ends {np.mean(ends):.1f}% higher" in text and f"needs {-np.mean(there):.1f}% fewer iterations" in text
+    gains = np.array(report.PAPER["to 90%"]["pidm_pretrained"]) < there
+    assert gains.sum() == 7 and "seven of nine gains are smaller" in text
+    last = {m: recorded("anymal_loco", m)[:, -4:].mean(1) for m in ("mlp", "pidm_random", "pidm_pretrained")}
+    assert last["pidm_pretrained"].min() > max(last["mlp"].max(), last["pidm_random"].max())
+    with_loaded, without = (
+        recorded("go1_loco", f"pidm_{m}_orthogonal")[:, -4:].mean() for m in ("pretrained", "random")
+    )
+    assert f"costs Go1 {100 * (1 - with_loaded / without):.1f}%" in text
 
 
 def test_other_pages_are_what_their_records_give(monkeypatch):
@@ -113,8 +318,19 @@ def test_report_writes_the_same_bytes_twice(tmp_path, monkeypatch):
     images = []
     for _ in range(2):
         report.draw_all(study)
-        images.append([(tmp_path / name).read_bytes() for name in ("curves.png", "updates.png")])
-    assert images[0] == images[1] and not (tmp_path / "sizes.png").exists()
+        images.append({path.name: path.read_bytes() for path in tmp_path.glob("*.png")})
+    assert images[0] == images[1] and {*images[0]} == {"curves.png", "controls.png"}  # what one task of walking allows
+
+
+def test_figures_of_parkour_and_updates_are_drawn(tmp_path, monkeypatch):
+    """A single seed, three methods; and that a figure goes once the runs no longer allow it."""
+    monkeypatch.setattr(report, "STUDY", tmp_path)
+    names = ("anymal_jump", "anymal_pedipulation")
+    study = {name: report.load_task(report.ROOT / f"results/study/cpu/{name}") for name in names}
+    report.draw_all(study)
+    assert {path.name for path in tmp_path.glob("*.png")} == {"curves.png", "success.png", "updates.png"}
+    report.draw_all({"anymal_jump": study["anymal_jump"]})
+    assert {path.name for path in tmp_path.glob("*.png")} == {"curves.png", "success.png"}
 
 
 @pytest.fixture
@@ -152,7 +368,7 @@ def test_bad_runs_are_left_out_with_a_warning(study, capsys):
     assert "left out" in capsys.readouterr().err
 
 
-def test_success_by_level_is_a_mean_over_runs_of_the_same_levels(study, capsys):
+def test_success_by_level_is_a_mean_over_runs_of_the_same_levels(study, capsys, monkeypatch, tmp_path):
     folder, args = study
     result = {f"level {i}": {"episode_success": share} for i, share in enumerate((1.0, 0.5))}
     for seed, last in ((0, 0.5), (1, 0.0)):
@@ -163,27 +379,47 @@ def test_success_by_level_is_a_mean_over_runs_of_the_same_levels(study, capsys):
         (target / "eval.json").write_text(json.dumps(result))
     runs = report.load_task(folder)
     assert list(runs) == ["mlp"] and "other settings" in capsys.readouterr().err  # PIDM random was run on no level
-    assert "success by level [%]" in report.details(runs)[-3] and "| 100 25 |" in report.details(runs)[-1]
+    assert drawing.success_of(runs["mlp"]).tolist() == [100.0, 25.0]
+    assert drawing.draw_success({"anymal_jump": runs}, tmp_path / "success.png")
 
 
 def test_without_a_baseline_there_is_no_level_to_reach(study):
     runs = report.load_task(study[0])
-    assert "no PIDM random" not in report.details(runs)[2]
-    alone = {"mlp": runs["mlp"]}
-    assert report.details(alone)[2].count("no PIDM random") == 2 and "not reached" not in report.details(alone)[2]
+    assert "no PIDM random" not in "".join(report.progress_table({"go1_loco": runs}))
+    alone = report.progress_table({"go1_loco": {"mlp": runs["mlp"]}})[-1]
+    assert alone.count("no PIDM random") == 2 and "not reached" not in alone
+
+
+def test_highest_level_reached_stands_where_it_was_recorded(study):
+    """Older rows have no progress_reached: their cell is empty, and so is the whole column if none has any."""
+    folder, _ = study
+    path = folder / "mlp/seed0/metrics.csv"
+    assert "reached" not in report.progress_table({"anymal_jump": report.load_task(folder)})[0]
+    names, *rows = path.read_text().splitlines()
+    path.write_text("\n".join([f"{names},progress_reached", *(f"{row},0.25" for row in rows)]) + "\n")
+    table = report.progress_table({"anymal_jump": report.load_task(folder)})
+    assert "progress reached at the end" in table[0] and "| 0.25 |" in table[2] and "|  |" in table[3]
 
 
 def test_sizes_are_those_that_were_pretrained_on(tmp_path, monkeypatch):
     monkeypatch.setattr(report, "ROOT", tmp_path)
     folder = tmp_path / "results/pidm/anymal_d"
     for stem, samples, error in (("sizes/7000_", 7000, 0.9), ("sizes/70000_", 70000, 0.6), ("", None, 0.3)):
-        for name, content in (("args", {"num_samples": samples}), ("validation", {"normalized_error": error})):
+        for name, content in (
+            ("args", {"num_samples": samples}),
+            ("validation", {"error_rad": error, "normalized_error": 2 * error}),
+        ):
             (folder / f"{stem}{name}.json").parent.mkdir(parents=True, exist_ok=True)
             (folder / f"{stem}{name}.json").write_text(json.dumps(content))
     (folder / "explore").mkdir()
     (folder / "explore/meta.json").write_text('{"transitions": 1000000}')
     assert report.sizes_of("anymal_d") == {7000: 0.9, 70000: 0.6, 1000000: 0.3}
-    assert report.draw_sizes({}, tmp_path / "sizes.png") and (tmp_path / "sizes.png").stat().st_size > 5000
+    run = {"pidm_random": flat(10.0, 11.0), "pidm_7k": flat(9.0, 9.5), "pidm_pretrained": flat(12.0, 13.0)}
+    study = {"anymal_climb_up": run, "anymal_climb_down": run}
+    assert drawing.draw_sizes(study, tmp_path / "sizes.png", report.sizes_of("anymal_d"))
+    assert (tmp_path / "sizes.png").stat().st_size > 5000
+    lines = report.sizes(study, report.titles("sizes"), tuple(study))
+    assert "Error by number of transitions: 0.900 rad (7,000), 0.600 rad (70,000), 0.300 rad (1,000,000)." in lines
 
 
 def test_live_draws_until_the_run_is_over(tmp_path, capsys):
