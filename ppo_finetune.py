@@ -38,6 +38,7 @@ class Args:
     task: str = "go1_loco"  # a name in envs.TASKS
     network: Literal["mlp", "pidm"] | None = None  # of actor and critic; None: pidm with --pretrained, else mlp
     pretrained: str | None = None  # PIDM checkpoint written by pretrain_pidm.py
+    policy: str | None = None  # start from the networks of this policy.msgpack, e.g. to make it robust with --robust
     load_into: Literal["both", "actor", "critic", "history_encoder", "shuffled"] = "both"  # see `warm_start`
     # Deviation (weight init): rsl_rl has PyTorch's; with orthogonal weights both quadrupeds learn faster.
     weight_init: Literal["orthogonal", "pytorch"] = "orthogonal"  # of all layers that are not loaded
@@ -74,7 +75,6 @@ class Args:
     entropy_coef: float | None = None  # weight of the entropy bonus
     mirror_coef: float = 0.1  # weight of the mirror loss; ours, the paper gives no number
     max_grad_norm: float = 1.0  # of actor and critic, each
-    # --- Devices ---
     distributed: bool = False  # this is one of several processes, one per host; process 0 writes the files
     shuffle_blocks: int | None = None  # shuffle samples within this many groups of environments; None: 1 per device
 
@@ -91,13 +91,15 @@ def merge(args, ppo):
     """Fill the fields left at None from the preset and the task's settings `ppo`, and check the result."""
     if args.pretrained and args.network == "mlp":
         raise records.UserError("--pretrained loads a PIDM; leave out --network mlp")
+    if args.policy and args.pretrained:
+        raise records.UserError("--policy and --pretrained exclude each other; leave one out")
     if args.load_into != "both" and not args.pretrained:
         raise records.UserError(f"--load-into {args.load_into} needs --pretrained CHECKPOINT")
     network = args.network or ("pidm" if args.pretrained else "mlp")
     loaded = "random" if not args.pretrained else "pretrained" if args.load_into == "both" else args.load_into
     method = "mlp" if network == "mlp" else f"pidm_{loaded}"
-    folder = f"runs/{args.task}/{method}"
-    values = {"network": network, "run_dir": folder if args.num_seeds > 1 else f"{folder}/seed{args.seed}"}
+    seed = f"/seed{args.seed}" * (args.num_seeds == 1)
+    values = {"network": network, "run_dir": f"runs/{args.task}/{method}{seed}"}
     values |= {"hidden": ppo["hidden"], "init_std": ppo["init_std"], "entropy_coef": ppo["entropy"]}
     values |= {"intention": ppo.get("intention"), "shuffle_blocks": jax.device_count()}
     values |= PRESETS[args.preset] | ppo.get(args.preset, {})
@@ -334,15 +336,12 @@ def rollout(args, env, net, params, env_state, key):
     """Act for T steps in N environments. Returns the last environment state, a Rollout and metrics (T,)."""
 
     def step(env_state, key):
-        # sample an action
         inputs = net.inputs(env_state.obs, env_state.history)
         mean, log_std, value = net.apply(params, inputs)
         action = mean + jnp.exp(log_std) * jax.random.normal(key, mean.shape)
-
         # step the environments, which reset themselves
         env_state = jax.vmap(env.step)(env_state, action)
         done = env_state.terminated | env_state.truncated
-
         # Deviation (time limits): rsl_rl bootstraps with V of the observation before the step, which is not the last.
         final_inputs = net.inputs(env_state.final_obs, env_state.final_history)
         final_value = net.apply(params, final_inputs, method=net.value)
@@ -515,6 +514,7 @@ def init_state(args, env, net, opt):
     params = net.init(k_net, net.inputs(env_state.obs, env_state.history))
     if args.network == "pidm":
         params = warm_start(args, env, params, jax.random.fold_in(key, 1))
+    params = records.load_policy(args.policy, params) if args.policy else params
     return TrainState(params, opt.init(params), jnp.float32(args.lr), env_state, key, jnp.zeros((), jnp.int32))
 
 

@@ -292,7 +292,8 @@ class WarpEngine(MjxEngine):
         super().__init__(spec, decimation)
         if importlib.util.find_spec("warp") is None:
             raise ImportError("engine warp needs the package warp-lang: pip install -r requirements-gpu.txt")
-        self.rows = 4 * self.contacts + self.model.nu  # four sides of a friction pyramid, and joint limits
+        # Four sides of a friction pyramid, joint limits, and joints with dry friction.
+        self.rows = 4 * self.contacts + self.model.nu + int(self.rubbing.sum())
         self.plain_model = copy.copy(self.model)
         # Warp never resets by itself, and refuses a model with the bit that says so.
         self.plain_model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)

@@ -31,18 +31,6 @@ def hasty_steps(landed_after, threshold):
     return jnp.sum(jnp.where(landed_after > 0, jnp.maximum(threshold - landed_after, 0.0), 0.0))
 
 
-def single_stance(air_time, contact_time, command):
-    """Time [s] for which one foot of a biped has stood and the other swung, at most 0.4; 0 on both feet or none."""
-    contact = contact_time > 0
-    phase = jnp.where(contact, contact_time, air_time)
-    return jnp.where(jnp.sum(contact) == 1, jnp.minimum(jnp.min(phase), 0.4), 0.0) * moving(command)
-
-
-def one_foot(contact, command):
-    """1 while exactly one foot is on the ground and the command moves. It rewards even a biped's shortest steps."""
-    return (jnp.sum(contact) == 1) * moving(command)
-
-
 def in_step(contact, stance):
     """Share of the feet that are on the ground or off it as the gait's clock asks; contact and stance (F,) bool."""
     return jnp.mean(contact == stance)
@@ -61,11 +49,6 @@ def impact(force, weight):
 def power(torque, joint_vel, weight):
     """Mechanical power that the motors give or take, over the weight [m/s]; (A,) [N m], (A,) [rad/s], [N]."""
     return jnp.sum(jnp.abs(torque * joint_vel)) / weight
-
-
-def flight(contact, command):
-    """1 while no foot is on the ground and the command moves: a hop instead of a walk; contact (F,)."""
-    return jnp.all(~contact) * moving(command)
 
 
 def moving(command):

@@ -261,6 +261,13 @@ RESULTS = (
 )
 
 
+def load_policy(path, like):
+    """Params of a policy file. UserError if it does not have the leaves and shapes of `like`."""
+    params, _ = load(Path(path), "policy")
+    check_shapes(path, params, like)
+    return jax.tree.map(jnp.asarray, params)
+
+
 def load_pidm(path, env, like):
     """Params and normalizer of a PIDM checkpoint, of which the parts in `like` (same keys) are returned.
 
