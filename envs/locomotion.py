@@ -68,6 +68,7 @@ class Locomotion(Env):
         super().__init__(config, engine)
         self.effort = joint_indices(self.robot, *config.effort_joints)
         self.weight = 9.81 * float(self.model.body_mass.sum())  # [N]
+        self.soft_limits = soft_limits(self.model, 0.8)
 
     def init_task(self, key, physics, course):
         motion = self.motion(physics)
@@ -156,6 +157,7 @@ class Locomotion(Env):
             "power": rewards.power(m.torque, m.joint_vel, self.weight),
             "stand_still": jnp.sum(jnp.abs(m.joint_pos)) * ~rewards.moving(task.command),
             "stand_on_feet": jnp.sum(~m.foot_contact) * ~rewards.moving(task.command),
+            "joint_limits": rewards.beyond(m.joint_pos + self.default_pose, *self.soft_limits),
             "pose": rewards.square(m.joint_pos),
             "alive": jnp.ones(()),
         }
@@ -184,18 +186,13 @@ class G1Locomotion(Locomotion):
 
     def __init__(self, config, engine="auto"):
         super().__init__(config, engine)
-        self.ankles = joint_indices(self.robot, "ankle")
         self.hips = joint_indices(self.robot, "hip_roll", "hip_yaw")
         self.arms = joint_indices(self.robot, "shoulder", "elbow", "wrist")
         self.waist = joint_indices(self.robot, "waist")
-        self.soft_limits = soft_limits(self.model, 0.9)
 
     def rewards(self, task, motion, action, last_action, clock):
         m = motion
-        low, high = self.soft_limits
-        ankles = (m.joint_pos + self.default_pose)[self.ankles]
         return super().rewards(task, motion, action, last_action, clock) | {
-            "ankle_limits": rewards.beyond(ankles, low[self.ankles], high[self.ankles]),
             "hip_deviation": jnp.sum(jnp.abs(m.joint_pos[self.hips])),
             "arm_deviation": jnp.sum(jnp.abs(m.joint_pos[self.arms])),
             "waist_deviation": jnp.sum(jnp.abs(m.joint_pos[self.waist])),
@@ -243,9 +240,11 @@ STEPS = {  # high, even steps with feet that do not slide, and rest where the co
     "track_yaw_rate": 2.0,
     "in_step": 0.7,
     "foot_path": 0.7,
-    "slip": -0.2,
+    "slip": -0.3,
     "air_time": 0.0,
-    "stand_still": -0.1,
+    "action_rate": -0.02,
+    "joint_limits": -5.0,
+    "stand_still": -0.2,
     "stand_on_feet": -1.0,
     "alive": 0.5,
 }
@@ -333,7 +332,7 @@ G1_LOCO = LocomotionConfig(
         "foot_path": 1.5,
         "slip": -0.2,
         "impact": -0.2,
-        "ankle_limits": -1.0,
+        "joint_limits": -1.0,
         "hip_deviation": -0.2,
         "arm_deviation": -0.1,
         "waist_deviation": -0.5,
