@@ -38,7 +38,7 @@ class Args:
     task: str = "go1_loco"  # a name in envs.TASKS
     network: Literal["mlp", "pidm"] | None = None  # of actor and critic; None: pidm with --pretrained, else mlp
     pretrained: str | None = None  # PIDM checkpoint written by pretrain_pidm.py
-    policy: str | None = None  # start from the networks of this policy.msgpack, e.g. to make it robust with --robust
+    policy: str | None = None  # start from actor and critic of this policy.msgpack, e.g. to make it robust
     load_into: Literal["both", "actor", "critic", "history_encoder", "shuffled"] = "both"  # see `warm_start`
     # Deviation (weight init): rsl_rl has PyTorch's; with orthogonal weights both quadrupeds learn faster.
     weight_init: Literal["orthogonal", "pytorch"] = "orthogonal"  # of all layers that are not loaded

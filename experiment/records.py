@@ -262,10 +262,14 @@ RESULTS = (
 
 
 def load_policy(path, like):
-    """Params of a policy file. UserError if it does not have the leaves and shapes of `like`."""
+    """Params of a policy file, but with the action std of `like`. UserError if it lacks the leaves and shapes of that.
+
+    A trained policy has a small std, with which it would hardly explore.
+    """
     params, _ = load(Path(path), "policy")
     check_shapes(path, params, like)
-    return jax.tree.map(jnp.asarray, params)
+    params = jax.tree.map(jnp.asarray, params)
+    return params | {"params": params["params"] | {"log_std": like["params"]["log_std"]}}
 
 
 def load_pidm(path, env, like):
