@@ -284,6 +284,9 @@ Disagreement is that of an ensemble trained on the first tenth of the collection
 outputs of the actor's backbone in the first rollout of a task. Their effective rank (Roy and Vetterli 2007) is the
 number of directions, of 64, that they fill. The study's pretrained arm is "loaded, the rest as PyTorch's".
 
+G1's data were made with 0.5 rad per unit of action for every joint. Its checkpoint has had its action normalisation
+rescaled to the present action scales, which leaves the function it computes as it was.
+
 """
 
 
