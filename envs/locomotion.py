@@ -316,6 +316,9 @@ GO1_LOCO = LocomotionConfig(
 
 G1_PARTS = ("thigh", "shin", "upperarm", "forearm", "hand")
 
+# Deviation (G1 gait): Isaac Lab's single_stance made it hop or shuffle. A clock that the policy sees sets the pace;
+# in_step and foot_path pay for it. Commands turn and stand more often, and tracking is low-passed: what noise does to
+# the turning rate hid the reward for it.
 G1_LOCO = LocomotionConfig(
     robot="g1",
     robust=ROBUST

@@ -1,9 +1,11 @@
-"""The environment contract: hooks, history, resets, noise, randomisation, mirrors, broken simulations, options."""
+"""The environment contract: hooks, history, resets, noise, randomisation, commands, mirrors, faults, options."""
 
 import dataclasses
 import io
 import re
 import sys
+from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +20,7 @@ from envs.base import PROP, Env
 from envs.config import fits, parse
 from envs.engine import ENGINES, make_engine
 from envs.robots import ROBOTS
+from tools import play_onnx
 
 TASKS = list(envs.TASKS)
 LOCOMOTION = ["anymal_loco", "go1_loco", "g1_loco"]  # one a robot; parkour has tests of its own
@@ -105,7 +108,7 @@ def test_slices_by_hand():
 
 
 def test_observation_widths():
-    widths = {"anymal_loco": 48, "go1_loco": 48, "g1_loco": 99, "anymal_pedipulation": 48, "anymal_crouch": 348}
+    widths = {"anymal_loco": 48, "go1_loco": 48, "g1_loco": 101, "anymal_pedipulation": 48, "anymal_crouch": 348}
     assert {task: envs.make(task, "c").obs_dim for task in TASKS} == dict.fromkeys(TASKS, 282) | widths
 
 
@@ -184,7 +187,7 @@ def test_history_is_what_the_policy_saw(jitted):
         ("joint_pos", slice(12, 24), slice(6, 18)),
         ("joint_vel", slice(24, 36), slice(18, 30)),
     ]:
-        np.testing.assert_allclose(obs[:, in_obs], prop[:, in_prop] * scales[name], rtol=1e-6)
+        np.testing.assert_allclose(obs[:, in_obs], prop[:, in_prop] * scales[name], rtol=1e-6, atol=1e-7)
 
 
 def test_noise_has_the_stated_width(jitted):
@@ -249,23 +252,337 @@ def test_divergence_is_caught_and_counted(jitted):
 
 def test_command_follows_the_heading(jitted):
     """The turning command is half the heading error within +-1; standing commands are exactly zero."""
-    env, state = jitted("go1_loco").env, jitted("go1_loco").start(512)
+    state = jitted("go1_loco").start(512)
     command, moves = np.asarray(state.task.command), np.asarray(state.task.moves)
     w, x, y, z = np.asarray(state.physics.qpos[:, 3:7]).T
     yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
     error = (np.asarray(state.task.heading) - yaw + np.pi) % (2 * np.pi) - np.pi
     np.testing.assert_allclose(command[moves, 2], np.clip(0.5 * error, -1, 1)[moves], atol=1e-5)
     assert not np.any(command[~moves]) and 0 < np.mean(~moves) < 0.06
-    assert np.abs(command[:, :2]).max() <= 1 and env.command_steps == 500
+    assert np.abs(command[:, :2]).max() <= 1 and np.all(np.asarray(state.task.steers))
+    assert np.all(np.asarray(state.task.remaining) == 500)
+
+
+def with_task(state, **fields):
+    return state.replace(task=state.task.replace(**fields))
 
 
 def test_command_changes_when_due(jitted):
+    """After the time that was drawn with it, whatever the clock says, and then for as long again."""
     task = jitted("go1_loco")
-    state = task.start(2)
-    before = task.hold(state.replace(clock=jnp.array([498, 100], jnp.int32)))
+    state = with_task(task.start(2), remaining=jnp.array([2, 100]))
+    before = task.hold(state.replace(clock=jnp.array([498, 499], jnp.int32)))
     after = task.hold(before)
     changed = np.any(np.asarray(after.task.command[:, :2] != before.task.command[:, :2]), axis=1)
+    assert before.task.remaining.tolist() == [1, 99] and after.task.remaining.tolist() == [500, 98]
     assert changed.tolist() == [True, False]
+
+
+def test_shares_and_ranges_of_commands():
+    """Of 20 000 draws the shares that the config states stand, turn on the spot or turn at a rate; times are even."""
+    env = envs.make("go1_loco", "c", standing=0.1, turning=0.3, on_the_spot=0.15, command_seconds=(3.0, 8.0))
+    drawn = jax.device_get(jax.vmap(env.draw_command)(jax.random.split(jax.random.key(0), 20_000)))
+    spot, rate = np.all(drawn["command"][:, :2] == 0, axis=1), ~drawn["steers"]
+    shares = [np.mean(~drawn["moves"]), np.mean(rate & spot), np.mean(rate & ~spot), np.mean(rate & ~drawn["moves"])]
+    np.testing.assert_allclose(shares, [0.1, 0.15, 0.3, 0.045], atol=0.012)
+    assert not np.any(spot & ~rate), "who turns to a heading walks"
+    seconds, turn = drawn["remaining"] * env.dt, drawn["command"][:, 2]
+    for values, low, high in ((seconds, 3, 8), (turn[rate], -1, 1), (drawn["heading"], -np.pi, np.pi)):
+        np.testing.assert_allclose(np.quantile(values, [0, 0.5, 1]), [low, (low + high) / 2, high], atol=0.1)
+
+
+def test_a_turning_rate_is_not_steered(jitted):
+    """It stays as drawn while the robot turns; a command to stand is zero whatever its kind."""
+    task = jitted("go1_loco")
+    command = jnp.tile(jnp.array([0.0, 0.0, 0.7]), (2, 1))
+    state = with_task(task.start(2), command=command, moves=jnp.array([True, False]), steers=jnp.zeros(2, bool))
+    state = task.hold(state.replace(physics=state.physics.replace(qvel=state.physics.qvel.at[:, 5].set(2.0))))
+    np.testing.assert_array_equal(state.task.command, [[0, 0, np.float32(0.7)], [0, 0, 0]])
+
+
+def test_a_command_that_was_set_holds(jitted):
+    """No other one follows, and no heading steers it, even if one was due in this step or told to stand."""
+    task = jitted("go1_loco")
+    state = with_task(task.start(3), remaining=jnp.array([1, 2, 400]), moves=jnp.array([True, False, True]))
+    command = jnp.array([[0.8, -0.2, 0.5], [0.3, 0.0, -1.0], [0.0, 0.0, 0.0]])
+    state = state.replace(task=jax.vmap(task.env.set_command)(state.task, command))
+    for i in range(4):
+        state = task.act(state, i)
+        np.testing.assert_array_equal(state.task.command, command)
+        np.testing.assert_allclose(state.obs[:, 9:12], command * jnp.array([2.0, 2.0, 0.25]))
+
+
+@pytest.mark.parametrize(("seconds", "share"), [(0.0, 1.0), (0.01, 1.0), (0.1, 0.2), (0.2, 0.1)])
+def test_tracked_velocity_is_low_passed(seconds, share):
+    """At a constant velocity the rest of the first one decays by a share of dt / seconds in each step, at most 1."""
+    env = envs.make("go1_loco", "c", tracking_seconds=seconds, spawn_velocity=0.5)
+    state = jax.jit(env.reset)(jax.random.key(0))
+    first, last = np.asarray(state.task.velocity), np.array([0.7, -0.3, 0.9])
+    np.testing.assert_allclose(first[2], state.physics.qvel[5], atol=1e-6)
+    motion = env.motion(state.physics)
+    motion = motion.replace(lin_vel=motion.lin_vel.at[:2].set(last[:2]), ang_vel=motion.ang_vel.at[2].set(last[2]))
+    task = state.task
+    for k in range(1, 6):
+        task = env.before_rewards(task, motion)
+        np.testing.assert_allclose(task.velocity, last + (first - last) * (1 - share) ** k, atol=1e-6)
+
+
+# --- the clock of a gait ---
+
+HALF = 20  # control steps; half a step at 1.25 steps a second
+
+
+@pytest.fixture
+def paced(jitted):
+    """paced(task): a walker with a clock whose half step is a whole number of control steps."""
+    return lambda task: jitted(task, noise=0.0, gait_hz=1 / (2 * HALF * 0.02))
+
+
+@pytest.mark.parametrize(
+    ("task", "pairs"),
+    [
+        ("g1_loco", {"left_foot": "right_foot"}),
+        ("go1_loco", {"FR_foot": "FL_foot", "RL_foot": "RR_foot"}),
+        ("anymal_loco", {"LF_foot": "RF_foot", "RH_foot": "LH_foot"}),
+    ],
+)
+def test_feet_of_the_gait_are_half_a_step_apart(paced, task, pairs):
+    """Diagonal feet move as one. Each stands for its share of a step, and swings up to the stated height and down."""
+    env, walk = paced(task).env, jnp.array([0.5, 0.0, 0.0])
+    stance, height = jax.vmap(lambda clock: env.gait(walk, clock))(jnp.arange(4 * HALF) + 0.5)
+    stance, height = np.asarray(stance), np.asarray(height)
+    first, other = ([env.robot.feet.index(foot) for foot in feet] for feet in (pairs.keys(), pairs.values()))
+    assert sorted(first + other) == list(range(len(env.robot.feet)))
+    np.testing.assert_array_equal(stance[:-HALF, first], stance[HALF:, other])
+    np.testing.assert_allclose(height[:-HALF, first], height[HALF:, other], atol=1e-5)
+    np.testing.assert_array_equal(stance[:, first], stance[:, first[:1] * len(first)])
+    np.testing.assert_allclose(stance.mean(0), env.config.stance, atol=0.01)
+    assert stance.any(1).all() and stance.all(1).mean() == pytest.approx(2 * env.config.stance - 1, abs=0.01)
+    assert np.abs(height[stance]).max() < 1e-6 and height[~stance].min() > 0
+    np.testing.assert_allclose(height.max(0), env.config.swing_height, rtol=0.01)
+    swing = height[: 2 * HALF, 0][~stance[: 2 * HALF, 0]]
+    np.testing.assert_allclose(swing, swing[::-1], atol=1e-5)
+    for still in ([0.0, 0.0, 0.0], [0.05, 0.05, 0.05]):
+        stance, height = env.gait(jnp.array(still), 3)
+        assert np.all(np.asarray(stance)) and not np.any(np.asarray(height))
+    assert not np.all(np.asarray(env.gait(jnp.array([0.0, 0.0, 0.5]), 3)[0])), "turning on the spot takes steps"
+
+
+def test_phase_is_the_clock_of_the_next_reward(paced):
+    """Sine and cosine of the time since the episode began, as the policy and a robot without JAX see it; 0 at rest."""
+    biped = paced("g1_loco")
+    state = biped.start(3)
+    command = jnp.array([[0.5, 0.0, 0.0], [0.0, 0.0, -0.4], [0.0, 0.0, 0.0]])
+    state = state.replace(clock=jnp.array([0, 7, 9], jnp.int32))
+    state = state.replace(task=jax.vmap(biped.env.set_command)(state.task, command))
+    moves = np.array([1, 1, 0])
+    for _ in range(3):
+        state = biped.hold(state)
+        angle = np.pi / HALF * np.asarray(state.clock)
+        want = np.stack([np.sin(angle), np.cos(angle)], 1) * moves[:, None]
+        np.testing.assert_allclose(state.obs[:, biped.env.obs_slices()["phase"]], want, atol=1e-5)
+        for n in range(3):
+            q, v, seconds = np.eye(1, 36, 3)[0], np.zeros(35), int(state.clock[n]) * 0.02
+            facts, data = {"gait_hz": biped.env.config.gait_hz}, SimpleNamespace(qpos=q, qvel=v)
+            robot = SimpleNamespace(data=data, facts=facts, seconds=seconds)
+            phase = play_onnx.Player.readings(robot, np.asarray(command[n]))["phase"]
+            np.testing.assert_allclose(phase, want[n], atol=1e-5)
+
+
+# --- the set for robots ---
+
+
+@pytest.fixture
+def varied(jitted):
+    """Go1 with late actions and readings, and motors that differ."""
+    ranges = {"action_delay": (0.0, 0.08), "sensor_lag": (0.0, 0.02), "motor_strength": (0.5, 1.5)}
+    return jitted("go1_loco", noise=0.0, joint_friction=(0.0, 0.5), **ranges)
+
+
+def alike(state, **fields):
+    """The same robot in every environment, with its joints as they should be and nothing late."""
+    count = state.reward.shape[0]
+    state = state.replace(physics=jax.tree.map(lambda x: jnp.stack([x[0]] * count), state.physics))
+    fit = {"strength": jnp.ones((count, 12)), "joint_friction": jnp.zeros(count)}
+    zero = {"delay": jnp.zeros(count), "lag": jnp.zeros(count)}
+    return state.replace(physics=state.physics.replace(**fit), **zero | fields)
+
+
+def test_randomised_delays_and_motors_are_drawn_in_their_ranges(varied):
+    """One delay, lag and joint friction a robot, one strength a motor, and new ones in a new episode."""
+    state = varied.start(256)
+    for values, low, high in (
+        (state.delay, 0, 4),
+        (state.lag, 0, 1),
+        (state.physics.strength, 0.5, 1.5),
+        (state.physics.joint_friction, 0, 0.5),
+    ):
+        middle = (low + high) / 2
+        np.testing.assert_allclose(np.quantile(values, [0, 0.5, 1]), [low, middle, high], atol=0.2 * middle)
+        assert low <= np.min(values) and np.max(values) <= high
+    assert np.ptp(np.asarray(state.physics.strength), axis=1).min() > 0.2
+    after = varied.hold(overturned(state))
+    for name in ("delay", "lag"):
+        assert (np.asarray(getattr(after, name)) != np.asarray(getattr(state, name))).tolist() == [True] + [False] * 255
+    plain = envs.make("go1_loco", "c")
+    start = jax.jit(plain.reset)(jax.random.key(0))
+    assert float(start.delay) == float(start.lag) == 0 and np.all(np.asarray(start.physics.strength) == 1)
+    assert not np.any(plain.model.dof_frictionloss), "no friction, no rows for the solver"
+
+
+def test_late_actions(varied):
+    """Delays of 0, 10, 20, 30, 40 and 80 ms: the engine gets targets of the actions in force, written out by hand."""
+    env, rng = varied.env, np.random.default_rng(0)
+    a = rng.normal(0, 0.4, (8, 12)).astype(np.float32)
+    none = np.zeros(12, np.float32)  # before the first action a robot holds its default pose
+    orders = {
+        0.00: list(a),
+        0.01: [a[0] / 2, *((a[k - 1] + a[k]) / 2 for k in range(1, 8))],
+        0.02: [none, *a[:7]],
+        0.03: [none, a[0] / 2, *((a[k - 2] + a[k - 1]) / 2 for k in range(2, 8))],
+        0.04: [none, none, *a[:6]],
+        0.08: [none, none, none, none, *a[:4]],
+    }
+    late = jnp.array(list(orders)) / 0.02
+    state = alike(varied.start(6), delay=late)
+    want, engine = state.physics, jax.jit(jax.vmap(env.engine.step))
+    for k in range(8):
+        state = varied.step(state, jnp.tile(a[k], (6, 1)))
+        followed = np.array([order[k] for order in orders.values()])
+        want = engine(want, np.array(env.robot.default_pose, np.float32) + np.float32(0.25) * followed)
+        assert not np.any(np.asarray(state.terminated))
+        np.testing.assert_allclose(state.physics.qpos, want.qpos, atol=1e-5)
+        np.testing.assert_allclose(state.history["action"][:, -1], jnp.tile(a[k], (6, 1)), err_msg="the policy's own")
+    assert np.abs(np.asarray(state.physics.qpos)[:-1, 7:] - np.asarray(state.physics.qpos)[1:, 7:]).max(1).min() > 0.01
+
+
+def test_late_readings(varied):
+    """At a lag of 20 ms x_t is that of the step before, at 10 ms the mean of the two; rewards see the truth."""
+    state, lag = alike(varied.start(3), lag=jnp.array([0.0, 0.5, 1.0])), np.array([[0.0], [0.5], [1.0]])
+    state = state.replace(task=jax.vmap(varied.env.set_command)(state.task, jnp.zeros((3, 3))))
+
+    def truth(physics):
+        qpos, qvel = np.asarray(physics.qpos), np.asarray(physics.qvel)
+        down, turn = [], np.zeros(9)
+        for quat in np.float64(qpos[:, 3:7]):
+            mujoco.mju_quat2Mat(turn, quat)
+            down.append(turn.reshape(3, 3).T @ [0, 0, -1])
+        return np.hstack([qvel[:, 3:6], down, qpos[:, 7:] - varied.env.robot.default_pose, qvel[:, 6:]])
+
+    state = state.replace(readings=jax.tree.map(lambda x: jnp.stack([x[0]] * 3), state.readings))
+    before = truth(state.physics)
+    for i in range(4):
+        state = varied.step(state, jnp.tile(0.5 * jax.random.normal(jax.random.key(i), (12,)), (3, 1)))
+        now = truth(state.physics)
+        np.testing.assert_allclose(state.history["prop"][:, -1], now + lag * (before - now), atol=1e-4)
+        np.testing.assert_allclose(state.obs[:, 24:36], 0.05 * (now + lag * (before - now))[:, 18:], atol=1e-5)
+        np.testing.assert_allclose(state.reward, jnp.repeat(state.reward[:1], 3), atol=1e-5)
+        assert np.abs(now - before).max() > 1
+        before = now
+
+
+def test_weak_motors_pull_less_up_to_the_same_limit():
+    """kp part of the torque in one physics step: strength x kp x (target - angle), within the limit of the MJCF."""
+    env = envs.make("go1_loco", "c", decimation=1)
+    physics = spawn(env)(jax.random.key(0))
+    strength = jnp.concatenate([jnp.array([0.5]), jnp.linspace(0.6, 1.4, 11)])
+    for offset in (0.1, -3.0):
+        after = jax.jit(env.engine.step)(physics.replace(strength=strength), physics.qpos[7:] + offset)
+        held = np.asarray(after.torque) + env.model.dof_damping[6:] * np.asarray(after.qvel[6:])
+        limit = env.model.actuator_forcerange[:, 1]
+        want = np.clip(np.asarray(strength) * env.model.actuator_gainprm[:, 0] * offset, -limit, limit)
+        np.testing.assert_allclose(held, want, rtol=1e-3)
+        assert (np.abs(want) < limit).all() == (offset == 0.1)
+    np.testing.assert_allclose(held, -limit, rtol=1e-5)
+
+
+def test_joint_friction_is_that_of_mujoco(varied):
+    """As a model with this frictionloss in every joint moves in plain MuJoCo; pulls below it hardly move a joint."""
+    env = varied.env
+    state = alike(varied.start(2))
+    physics = state.physics.replace(joint_friction=jnp.array([0.0, 0.4]), qpos=state.physics.qpos.at[:, 2].add(0.5))
+    start, target = np.asarray(physics.qpos[0]), env.default_pose + 0.01  # 0.2 to 0.3 N m
+    step, moved = jax.jit(jax.vmap(env.engine.step)), []
+    spec = envs.make("go1_loco", "c").scene()
+    spec.option.timestep = 0.005
+    for joint in spec.joints[1:]:
+        joint.frictionloss = 0.4
+    model = spec.compile()
+    model.geom_friction[model.geom_contype > 0, 0] = physics.friction[0]
+    model.body_mass[:] *= physics.mass_scale[0]
+    model.body_inertia[:] *= np.asarray(physics.mass_scale[0])[:, None]
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:], data.ctrl[:] = start, physics.qvel[0], target
+    for _ in range(5):
+        physics = step(physics, jnp.stack([target] * 2))
+        data.qacc_warmstart[:] = 0
+        mujoco.mj_step(model, data, nstep=4)
+        np.testing.assert_allclose(physics.qpos[1], data.qpos, atol=1e-5)
+        moved.append(np.abs(np.asarray(physics.qpos) - start)[:, 7:].mean(1))
+    free, rubbed = moved[-1]
+    assert free > 0.01 and rubbed < free / 5
+
+
+def test_actions_of_g1_are_scaled_joint_by_joint():
+    """A unit of action asks for a quarter of the joint's torque limit, by the gains in the MJCF, or for 0.5 rad."""
+    env = envs.make("g1_loco", "c", noise=0.0)
+    kp, limit = env.model.actuator_gainprm[:, 0], env.model.actuator_forcerange[:, 1]
+    scale = np.minimum(0.25 * limit / kp, 0.5)
+    np.testing.assert_allclose(env.robot.action_scale, scale, atol=1e-3)
+    assert scale.min() < 0.1 and scale.max() == 0.5
+    state = jax.eval_shape(env.reset, jax.random.key(0))
+    state = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), state.replace(key=None))
+    action = np.linspace(-1, 1, env.action_dim, dtype=np.float32)
+    want = np.array(env.robot.default_pose) + scale * action
+    np.testing.assert_allclose(env.joint_targets(state, action), want, atol=1e-3)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_robust_set(task):
+    """Three walkers have one, which replaces fields of their config and no other; the rest refuse in one line."""
+    usual = envs.TASKS[task][1]
+    if task not in LOCOMOTION:
+        words = f"{task} has no robust set; anymal_loco, go1_loco, g1_loco have one"
+        with pytest.raises(ValueError, match=words) as refusal:
+            envs.make(task, "c", robust=True)
+        assert "\n" not in str(refusal.value)
+        return
+    config = envs.make(task, "c", robust=True, noise=0.0).config
+    assert config == dataclasses.replace(usual, **usual.robust | {"noise": 0.0}) and config != usual
+    harder = ("action_delay", "sensor_lag", "motor_strength", "joint_friction", "friction", "link_mass", "added_mass")
+    for name in harder:
+        low, high = getattr(config, name)
+        assert low < high and low <= getattr(usual, name)[0] and getattr(usual, name)[1] <= high, name
+    assert config.push_velocity >= usual.push_velocity and config.turning > 0 and config.on_the_spot > 0
+
+
+def test_the_documented_robust_sets_are_those_of_the_configs():
+    """Each row of the table in docs/ppo_finetune.md, and a row for each field but weights and gait."""
+    text = (Path(__file__).parent.parent / "docs/ppo_finetune.md").read_text().split("### Train for a robot")[1]
+    rows = dict(re.findall(r"^\| `(\w+)` \| (.+) \|$", text.split("\n## ")[0], re.M))
+    for i, task in enumerate(LOCOMOTION):
+        usual = envs.TASKS[task][1]
+        config = envs.replace_checked(usual, usual.robust)
+        assert usual.robust.keys() - {"weights", "gait_hz", "stance", "swing_height"} <= rows.keys()
+        for name, row in rows.items():
+            numbers = [float(word) for word in row.split(" | ")[i].split(" to ")]
+            assert numbers == np.ravel(getattr(config, name)).tolist(), (task, name)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        ("action_delay", (0.0, 0.09), "action_delay must be from 0 to 0.08 s, not (0.0, 0.09)"),
+        ("action_delay", "-0.01,0", "action_delay must be from 0 to 0.08 s, not (-0.01, 0.0)"),
+        ("action_delay", "0.04,0.02", "action_delay must be from 0 to 0.08 s"),
+        ("sensor_lag", "0,0.03", "sensor_lag must be from 0 to 0.02 s"),
+        ("command_seconds", "0,5", "command_seconds must be above 0"),
+        ("robust", "{}", "robust cannot be set: --robust turns it on as a whole"),
+    ],
+)
+def test_what_no_robot_does_is_refused(name, value, words):
+    with pytest.raises(ValueError, match=re.escape(words)):
+        envs.make("go1_loco", "c", **{name: value})
 
 
 def test_pushes(jitted):
@@ -284,21 +601,26 @@ def test_randomised_fields_reach_the_engine(engine):
     """Heavier robots press harder, slippery ones slide, wrenches push: the same on every engine."""
     if engine == "warp":
         pytest.importorskip("warp")
-    env = envs.make("go1_loco", engine, noise=0.0, spawn_xy=0.0, spawn_yaw=0.0, added_mass=(0.0, 0.0))
-    one = spawn(env)(jax.random.key(0))
+    fixed = {"noise": 0.0, "spawn_xy": 0.0, "spawn_yaw": 0.0, "added_mass": (0.0, 0.0)}
+    env = envs.make("go1_loco", engine, joint_friction=(0.0, 5.0), **fixed)
+    one = spawn(env)(jax.random.key(0)).replace(joint_friction=jnp.zeros(()))
     trunk = env.model.body("trunk").id
-    batch = jax.tree.map(lambda x: jnp.stack([x] * 4), one)
+    batch = jax.tree.map(lambda x: jnp.stack([x] * 6), one)
     batch = batch.replace(
         mass_scale=batch.mass_scale.at[1, trunk].mul(2.0),
         friction=batch.friction.at[2].set(0.01),
-        wrench=batch.wrench.at[2:, trunk, 0].set(20.0),
+        wrench=batch.wrench.at[2:4, trunk, 0].set(20.0),
+        strength=batch.strength.at[4].set(0.5),
+        joint_friction=batch.joint_friction.at[5].set(5.0),
     )
     step = jax.jit(jax.vmap(env.engine.step))
     for _ in range(25):
-        batch = step(batch, jnp.tile(env.default_pose, (4, 1)))
+        batch = step(batch, jnp.tile(env.default_pose, (6, 1)))
     height, forward = np.asarray(batch.qpos)[:, [2, 0]].T
     assert height[1] < height[0] - 0.01, "twice the trunk mass sags"
     assert forward[2] > 0.1 > forward[3], "a pull of 20 N slides the slippery robot and not the other"
+    assert height[4] < height[0] - 0.01, "half the strength sags"
+    assert height[5] > height[0] + 0.003, "joints that rub hold the robot up"
 
 
 @pytest.mark.parametrize("name", ROBOTS)
@@ -338,9 +660,12 @@ def test_vmap_twice_is_one_batch(jitted):
 
 
 @pytest.mark.parametrize("task", LOCOMOTION)
-def test_mirrored_rollout_is_seen_mirrored(jitted, task):
-    """Simulate a robot and its mirror image; observation, x_t and reward of the one map onto those of the other."""
-    base = jitted(task, noise=0.0)
+def test_mirrored_rollout_is_seen_mirrored(paced, task):
+    """Simulate a robot and its mirror image; observation, x_t and reward of the one map onto those of the other.
+
+    The image is half a step later in its gait.
+    """
+    base = paced(task)
     env = base.env
     for mirror in env.mirrors:
         perm, sign = env.robot.mirror_joints(mirror)
@@ -357,10 +682,12 @@ def test_mirrored_rollout_is_seen_mirrored(jitted, task):
             return jnp.concatenate([base_pos, turn, joints[0]], 1), jnp.concatenate([*base_vel, joints[1]], 1)
 
         qpos, qvel = reflect(p.qpos, p.qvel)
+        planar = jnp.array([polar[0], polar[1], axial[2]])
         flipped_task = state.task.replace(
-            command=state.task.command * jnp.array([polar[0], polar[1], axial[2]]), heading=-state.task.heading
+            command=state.task.command * planar, velocity=state.task.velocity * planar, heading=-state.task.heading
         )
         image = state.replace(physics=p.replace(qpos=qpos, qvel=qvel), task=flipped_task)
+        image = image.replace(clock=image.clock + HALF)
         for i in range(4):
             action = 0.3 * jax.random.normal(jax.random.key(i), (4, env.action_dim))
             state = base.step(state, action)
@@ -393,6 +720,7 @@ OPTIONS = [  # task, name, text after --set NAME=, value
     ("go1_loco", "push_axes", "6", 6),
     ("go1_loco", "friction", "0.3,1.2", (0.3, 1.2)),
     ("go1_loco", "lin_vel_x", "-1, 2", (-1.0, 2.0)),
+    ("go1_loco", "command_seconds", "3,8", (3.0, 8.0)),
     ("go1_loco", "added_mass", "(-1,3)", (-1.0, 3.0)),
     ("go1_loco", "fixed_velocity", "none", None),
     ("go1_loco", "fixed_velocity", "1,0", (1.0, 0.0)),
@@ -430,7 +758,12 @@ def test_options_leave_the_rest_as_it_is():
 
 
 REFUSALS = [
-    ("go1_loco", "gravity", "1", "unknown option 'gravity'; choose one of added_mass, air_time_threshold, command_sec"),
+    (
+        "go1_loco",
+        "gravity",
+        "1",
+        "unknown option 'gravity'; choose one of action_delay, added_mass, air_time_threshold, com",
+    ),
     ("go1_loco", "weights.fun", "1", "unknown option 'weights.fun'; choose one of weights.action_rate, weights.air_"),
     ("go1_loco", "engine", "c", "unknown option 'engine'; choose one of"),
     ("go1_loco", "task", "c", "unknown option 'task'; choose one of"),

@@ -195,6 +195,7 @@ def test_collection_on_disk(collected):
     """Stored x_t and a_t are the windows that the last rollout's ensemble data show; meta.json counts them."""
     out, state = collected
     meta = json.loads((out / "meta.json").read_text())
+    assert meta["action_scale"] == [0.25] * 12
     assert meta["robot"] == "go1" and meta["transitions"] == 800 and meta["validation_envs"] == [3]
     arrays = {name: np.load(out / f"{name}.npy") for name in ("x", "action", "first", "rough", "lin_vel")}
     assert arrays["x"].shape == (25, 8, 4, 30) and arrays["lin_vel"].shape == (25, 8, 4, 3)

@@ -46,7 +46,7 @@ def test_onboard_policy_is_the_trained_one(task, network):
         action, target, *after = policy(*(jnp.asarray(given[name], jnp.float32) for name in shapes))
         inputs = net.inputs(state.obs, state.history)
         np.testing.assert_allclose(action, net.apply(params, inputs, method=net.mean), atol=1e-4)
-        np.testing.assert_allclose(target, env.default_pose + env.robot.action_scale * action, atol=1e-6)
+        np.testing.assert_allclose(target, env.default_pose + np.array(env.robot.action_scale) * action, atol=1e-6)
         history = dict(zip(history, after, strict=True))
         state = step(state, action)
     assert np.abs(action).max() > 1e-2, "the policy acts"
@@ -79,6 +79,7 @@ def test_onnx_walks_in_plain_mujoco_as_jax_would(exported):
 def test_metadata_of_the_file(exported):
     facts = play_onnx.Player(exported).facts
     assert facts["task"] == "go1_loco" and len(facts["joints"]) == len(facts["default_pose"]) == 12
+    assert facts["action_scale"] == [0.25] * 12 and "gait_hz" not in facts, "no clock, no input of one"
     assert facts["prop"] == list(PROP) and facts["dt"] == 0.02 and "commit" in facts["versions"]
 
 

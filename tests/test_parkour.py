@@ -195,11 +195,18 @@ def climb_up(jitted):
     return env, jax.jit(env.reset)(jax.random.key(0))
 
 
-def rule(env, state, level, distance, start_distance, terminated, best=0, rough=False):
-    """The next level and best of an environment at a level whose episode ends at a distance."""
+def rule(env, state, level, distance, start_distance, terminated, best=0, rough=False, reached=0):
+    """The next level and best of an environment at a level whose episode ends, standing, at a distance."""
+    return curriculum(env, state, level, distance, start_distance, terminated, best, rough, reached)[:2]
+
+
+def curriculum(env, state, level, distance, start_distance, terminated, best=0, rough=False, reached=0):
+    """As `rule`, and the highest level reached."""
     task = state.task.replace(
         level=jnp.int32(level),
         best=jnp.int32(best),
+        reached=jnp.int32(reached),
+        feet_only=jnp.int32(50),
         start_distance=jnp.float32(start_distance),
         rough=jnp.array(rough),
     )
@@ -207,7 +214,7 @@ def rule(env, state, level, distance, start_distance, terminated, best=0, rough=
     goal = motion.base_pos + jnp.array([distance, 0.0, 0.0])
     ended = jnp.asarray(terminated)
     after = env.next_curriculum(jax.random.key(1), task.replace(goal=goal), motion, ended, ~ended)
-    return int(after["level"]), int(after["best"])
+    return int(after["level"]), int(after["best"]), int(after["reached"])
 
 
 def test_promotion_and_demotion(climb_up):
@@ -219,6 +226,123 @@ def test_promotion_and_demotion(climb_up):
     assert rule(env, state, 0, 1.9, 2.0, False) == (0, 0)
     level, best = rule(env, state, 9, 0.1, 2.0, False, best=8)
     assert 0 <= level <= 9 and best == 9
+
+
+def test_the_highest_level_reached_never_falls(climb_up):
+    """It counts a level that was drawn, not one that was solved, and ends at the last one."""
+    env, state = climb_up
+    assert curriculum(env, state, 3, 0.3, 2.0, False, reached=3) == (4, 3, 4)
+    assert curriculum(env, state, 4, 1.9, 2.0, False, best=3, reached=4) == (3, 3, 4)
+    assert curriculum(env, state, 0, 1.9, 2.0, False)[2] == 0
+    assert curriculum(env, state, 9, 0.1, 2.0, False, best=8, reached=9)[2] == 9
+    assert curriculum(env, state, 3, 0.3, 2.0, False, reached=3, rough=True)[2] == 3
+    task = state.task.replace(level=jnp.int32(2), best=jnp.int32(3), reached=jnp.int32(6))
+    shown = env.task_metrics(task, env.motion(state.physics), jnp.asarray(True))
+    assert float(shown["progress"]) == pytest.approx(3 / 9) and float(shown["progress_reached"]) == pytest.approx(6 / 9)
+    assert int(env.at_level(5)["reached"]) == 5
+
+
+def standing(env, state):
+    """Motion and task of a robot that has stood at its goal for a second. The ground under it is at 0.2 m."""
+    motion = env.motion(state.physics)
+    slabs = motion.mocap_pos.at[0].set(motion.base_pos - jnp.array([0.0, 0.0, 0.5 + env.half[0, 2]]))
+    motion = motion.replace(
+        gravity=jnp.array([0.0, 0.0, -1.0]),
+        mocap_pos=slabs,
+        sensors=jnp.zeros_like(motion.sensors),
+        joint_pos=jnp.zeros(12),
+    )
+    task = state.task.replace(goal=motion.base_pos, feet_only=jnp.int32(50))
+    return motion, task
+
+
+def tilted(motion, degrees):
+    """Motion pitched nose-down."""
+    angle = np.deg2rad(degrees)
+    return motion.replace(gravity=jnp.array([np.sin(angle), 0.0, -np.cos(angle)], jnp.float32))
+
+
+def lowered(motion, height):
+    """Motion with the base at a height above the ground under it, which was 0.5 m below."""
+    return motion.replace(base_pos=motion.base_pos.at[2].add(height - 0.5))
+
+
+def test_success_is_to_stand_on_the_feet_at_the_goal(climb_up):
+    """Each line but the first breaks one condition: place, time, tilt, height above the ground, contacts."""
+    env, state = climb_up
+    motion, task = standing(env, state)
+
+    def success(motion=motion, task=task, truncated=True):
+        return bool(env.succeeded(task, motion, jnp.asarray(truncated)))
+
+    assert success() and success(tilted(motion, 24.0)) and success(lowered(motion, 0.36))
+    assert not success(truncated=False)
+    assert success(task=task.replace(goal=motion.base_pos + jnp.array([0.49, 0, 0])))
+    assert not success(task=task.replace(goal=motion.base_pos + jnp.array([0.51, 0, 0])))
+    assert not success(tilted(motion, 26.0)) and not success(tilted(motion, 60.0)), "nose-down"
+    assert not success(tilted(motion, 180.0)), "on its back"
+    assert float(motion.base_pos[2]) > 0.5 and not success(lowered(motion, 0.34)), "lying on a box"
+    assert not success(task=task.replace(feet_only=jnp.int32(5))), "a knee touched 0.1 s ago"
+    assert success(task=task.replace(feet_only=jnp.int32(10)))
+
+
+@pytest.mark.parametrize("body", ["base", "LF_knee", "RH_thigh", "RF_shank"])
+def test_the_time_on_the_feet_alone_starts_again_at_a_touch(body, climb_up):
+    """Of any body but a foot. The sensor is looked up in the MJCF by its name."""
+    env, state = climb_up
+    motion, task = standing(env, state)
+
+    def touch(name, force):
+        sensor = env.model.sensor(f"{name}_force")
+        return motion.replace(sensors=motion.sensors.at[sensor.adr[0] + 2].set(force))
+
+    task = env.before_rewards(task, touch("LF_foot", 200.0))
+    assert int(task.feet_only) == 51, "feet may touch"
+    task = env.before_rewards(task, touch(body, 5.0))
+    assert int(task.feet_only) == 0
+    for _ in range(9):
+        task = env.before_rewards(task, motion)
+    assert not bool(env.succeeded(task, motion, jnp.asarray(True)))
+    task = env.before_rewards(task, motion)
+    assert bool(env.succeeded(task, motion, jnp.asarray(True)))
+
+
+def test_a_robot_that_holds_its_pose_succeeds_and_one_on_its_belly_does_not(jitted):
+    """In the simulator: the goal is where it stands, and the time is up after a second; legs folded, it lies."""
+    calm = {"rough": 0.0, "noise": 0.0, "spawn_velocity": 0.0, "push_velocity": 0.0, "base_force": 1e6}
+    task = jitted("anymal_climb_up", **calm)
+    state = task.start(2)
+    state = state.replace(clock=jnp.full(2, task.env.episode_steps - 50))
+    state = state.replace(task=state.task.replace(goal=state.physics.qpos[:, :3]))
+    folded = jnp.array([0.0, 1.4, -1.9] * 2 + [0.0, -1.4, 1.9] * 2)
+    action = jnp.stack([jnp.zeros(12), folded / task.env.action_scale])
+    for _ in range(50):
+        state = task.step(state, action)
+    assert np.asarray(state.truncated).all() and np.asarray(state.metrics["goal_distance"] < 0.5).all()
+    np.testing.assert_array_equal(state.metrics["episode_success"], [1.0, 0.0])
+
+
+def test_standing_up_at_the_goal_pays_at_every_step(climb_up):
+    """`on_feet` is 1 on the feet, and rises as tilt, contacts or a low base are mended one by one."""
+    env, state = climb_up
+    motion, task = standing(env, state)
+
+    def paid(motion, clock=280, task=task):
+        return float(env.rewards(task, motion, jnp.zeros(12), jnp.zeros(12), clock)["on_feet"])
+
+    def kneeling(motion, *bodies):
+        where = np.array([env.model.sensor(f"{name}_force").adr[0] for name in bodies])
+        return motion.replace(sensors=motion.sensors.at[where].set(5.0))
+
+    assert paid(motion) == pytest.approx(1.0) and paid(tilted(motion, 24.0)) == pytest.approx(1.0)
+    rising = [kneeling(tilted(lowered(motion, 0.2), 60.0), "LF_knee", "RF_knee")]
+    rising += [kneeling(tilted(lowered(motion, 0.2), 60.0), "LF_knee"), tilted(lowered(motion, 0.2), 60.0)]
+    rising += [tilted(lowered(motion, 0.2), 40.0), tilted(lowered(motion, 0.3), 40.0), lowered(motion, 0.3), motion]
+    values = [paid(one) for one in rising]
+    assert values[0] > 0 and (np.diff(values) > 0.02).all(), values
+    assert values[0] == pytest.approx(0.3 * (0.2 / 0.35) / 3, rel=1e-3)
+    assert paid(motion, clock=200) == 0.0, "before the last second"
+    assert paid(motion, task=task.replace(goal=motion.base_pos + jnp.array([0.6, 0, 0]))) == 0.0, "elsewhere"
 
 
 def test_rough_ground_moves_no_level(climb_up):
@@ -317,6 +441,10 @@ def test_parkour_rewards_by_hand(climb_up):
     got = env.rewards(near, bent, zero, zero, 280)
     assert float(got["position"]) == pytest.approx(0.9) and float(got["heading"]) == pytest.approx(0.8)
     assert float(got["stand"]) == pytest.approx(5.0) and float(got["wait"]) == 0.0
+    beside = env.rewards(task.replace(goal=jnp.array([0.4, 0, 0])), bent, zero, zero, 280)
+    assert float(beside["stand"]) == pytest.approx(5.0), "no way out at 0.26 m"
+    assert float(env.rewards(task, bent, zero, zero, 280)["stand"]) == 0.0
+    assert float(env.rewards(near, bent, zero, zero, 100)["stand"]) == 0.0
     early = env.rewards(task.replace(goal=jnp.array([0.4, 0, 0])), bent, zero, zero, 100)
     assert float(early["position"]) == 0.0 and float(early["wait"]) == 1.0
     assert set(env.config.weights) == set(got)

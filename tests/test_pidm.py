@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -375,6 +376,8 @@ def test_errors_on_made_up_predictions(go1, dataset):
     want = {"error": 0.5, "error_rad": 0.125, "normalized_error": 0.25, "error_over_change": 0.5}
     assert {name: found[name] for name in want} == pytest.approx(want)
     assert found["last_action_error"] == pytest.approx(1.0)
+    mixed = SimpleNamespace(robot=SimpleNamespace(action_scale=(0.1,) * 6 + (0.5,) * 6))
+    assert script.errors(mixed, dataset, outcome)["error_rad"] == pytest.approx(0.5 * (0.1 + 0.5) / 2)
 
 
 def test_eval_repeats_the_validation(pretrained, tmp_path):

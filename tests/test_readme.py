@@ -32,6 +32,7 @@ SMALL = {
     "ppo_finetune.py": "--preset smoke --num-envs 4 --num-steps 4 --total-steps 32 --force",
     "play.py": "--episodes 2",
     "results/study.py": "--budget-minutes 0",
+    "tools/gait.py": "--starts 1 --seconds 2",
     "tools/play_onnx.py": "--seconds 2",
 }
 FORMS = {"--export": "jax2onnx", "tools/play_onnx.py": "onnxruntime"}  # what needs more than requirements.txt

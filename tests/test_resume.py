@@ -167,6 +167,7 @@ def test_arguments_of_another_version_are_refused(script, tmp_path, refused):
         (ppo_finetune, {"lr": 1e-4}, "--lr"),
         (ppo_finetune, {"set": ("noise=0.5",)}, "--set"),
         (ppo_finetune, {"run_dir": "elsewhere"}, "--run-dir"),
+        (ppo_finetune, {"robust": True}, "--robust"),
         (ppo_explore, {"num_envs": 8}, "--num-envs"),
         (pretrain_pidm, {"mirror": False}, "--mirror"),
     ],

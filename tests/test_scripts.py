@@ -151,17 +151,18 @@ def test_wrong_policies_are_refused(trained, tmp_path, refused):
 
 
 def test_set_reaches_the_environment_and_the_records(tmp_path, monkeypatch):
-    """The numbers typed after --set hold in the training, and are recorded; play.py then starts from them."""
+    """--robust and then --set hold in the training, and are recorded; --resume and play.py start from them."""
     out, words = tmp_path / "run", ("push_velocity=0.25", "friction=0.3,1.2", "weights.slip=-0.5")
     made, make = [], envs.make
     monkeypatch.setattr(envs, "make", lambda *args, **fields: made.append(make(*args, **fields)) or made[-1])
-    script.main(dataclasses.replace(SMOKE, set=words, run_dir=str(out)))
+    script.main(dataclasses.replace(SMOKE, robust=True, set=words, run_dir=str(out)))
     (env,) = made
-    usual = envs.TASKS["go1_loco"][1]
+    usual = dataclasses.replace(envs.TASKS["go1_loco"][1], **envs.TASKS["go1_loco"][1].robust)
     changes = {"push_velocity": 0.25, "friction": (0.3, 1.2), "weights": usual.weights | {"slip": -0.5}}
     assert env.config == dataclasses.replace(usual, **changes)
     record = json.loads((out / "args.json").read_text())
-    assert record["set"] == list(words) and record["config"] == json.loads(json.dumps(dataclasses.asdict(env.config)))
+    assert record["robust"] is True and record["set"] == list(words)
+    assert record["config"] == json.loads(json.dumps(dataclasses.asdict(env.config)))
     script.main(script.Args(resume=str(out)))
     assert made[1].config == env.config
     played, *_ = play.load_policy(out / "policy.msgpack", "c", ("friction=0.5,0.5",), noise=0.0)
@@ -171,10 +172,11 @@ def test_set_reaches_the_environment_and_the_records(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["gravity=3"], "unknown option 'gravity'; choose one of added_mass"),
+        (["gravity=3"], "unknown option 'gravity'; choose one of action_delay"),
         (["friction=abc"], "friction takes two numbers like 0.3,1.2, not 'abc'"),
         (["weights.glide=1"], "unknown option 'weights.glide'; choose one of weights."),
         (["ppo={}"], "ppo cannot be set"),
+        (["robust=false"], "robust cannot be set: --robust turns it on as a whole"),
         (["friction"], "--set takes NAME=VALUE, not 'friction'"),
         (["noise=0.5", "push_seconds=inf,inf"], "push_seconds takes two numbers"),
     ],
@@ -199,6 +201,7 @@ def test_set_from_the_command_line():
     [
         ({"task": "go2_loco"}, ["unknown task 'go2_loco'", "go1_loco"]),
         ({"engine": "bullet"}, ["unknown engine 'bullet'", "c, mjx"]),
+        ({"task": "anymal_jump", "robust": True}, ["anymal_jump has no robust set; anymal_loco, go1_loco, g1_loco"]),
         ({"num_envs": 0}, ["--num-envs must be at least 1"]),
         ({"num_minibatches": 5}, ["5 minibatches do not divide", "16"]),
         ({"total_steps": -1}, ["--total-steps must be at least 1"]),

@@ -20,7 +20,7 @@ MODULES = {  # package -> its modules; each may import what stands before it
         *("gl", "rotations", "config", "robots", "terrain", "engine", "rewards", "base", "courses"),
         *("locomotion", "explore", "pedipulation", "parkour", "render"),
     ),
-    "experiment": ("records", "devices", "metrics", "figures", "dataset", "progress", "run"),
+    "experiment": ("records", "devices", "metrics", "figures", "dataset", "progress", "run", "gait"),
 }
 BELOW = {  # what a part of the project may import, besides itself
     "envs": set(),

@@ -2,6 +2,7 @@
 
 import csv
 import dataclasses
+import io
 import shutil
 import signal
 import socket
@@ -21,6 +22,7 @@ from PIL import Image
 import envs
 import play
 import ppo_finetune
+from envs import render
 from experiment import records
 from tools import viewer
 
@@ -234,6 +236,55 @@ def test_films(tmp_path, monkeypatch, capsys):
     with Image.open(tmp_path / "new/walk.gif") as gif:
         assert gif.n_frames == len(drawn[0]) == 500 and gif.info["duration"] == 40
     assert drawn[0][-1][0] - drawn[0][0][0] > 10, "it walked"
+
+
+@pytest.mark.parametrize("shade", [30, 110, 240])
+def test_time_and_title_can_be_read_on_dark_and_light_pictures(shade):
+    """White letters with a black edge, in the upper and lower left corners alone."""
+    image = Image.new("RGB", (320, 240), (shade,) * 3)
+    render.stamp(image, "1.20 s", "level 4, PIDM pretrained")
+    grey = np.asarray(image.convert("L")).astype(int)
+    for corner in (grey[:24, :60], grey[-24:, :200]):
+        assert corner.max() > 250 and corner.min() < 5 and (np.abs(corner - shade) > 100).mean() > 0.05
+    assert (grey[24:-24] == shade).all() and (grey[:, 240:] == shade).all()
+    bare = Image.new("RGB", (320, 240), (shade,) * 3)
+    render.stamp(bare, "1.20 s", "")
+    assert (np.asarray(bare)[24:] == shade).all(), "no title"
+
+
+def test_a_film_of_parkour_shows_title_goal_and_end(jitted, monkeypatch):
+    """The strip's last frame is within 0.2 s of the end, the robot's picture is close, and the goal a sphere."""
+    seen, stamps = {}, []
+
+    def draw(spec, qpos):
+        seen.update(spec=spec, steps=qpos[:, 0])
+        return [Image.new("RGB", (render.WIDTH, render.HEIGHT)) for _ in qpos]
+
+    monkeypatch.setattr(render, "draw", draw)
+    monkeypatch.setattr(render, "stamp", lambda _, *words: stamps.append(words))
+    env = jitted("anymal_climb_up").env
+    state = jax.jit(env.reset)(jax.random.key(0))
+    qpos = np.tile(state.physics.qpos, (env.episode_steps, 1))
+    qpos[:, 0] = np.arange(env.episode_steps)
+    goal = env.markers(state.task)
+    made = render.film(env, qpos, state.physics, title="level 4, MLP", markers=goal, **env.FILM_WINDOW)
+    sheet = Image.open(io.BytesIO(made["rollout.png"]))
+    assert sheet.size == (5 * render.WIDTH, 2 * render.HEIGHT), "ten frames"
+    assert {title for _, title in stamps} == {"level 4, MLP"} and ("0.40 s", "level 4, MLP") in stamps
+    assert env.episode_steps - 10 < seen["steps"].max() < env.episode_steps - 1, "the last step shows the next episode"
+    model = seen["spec"].compile()
+    (site,) = np.flatnonzero(model.site_bodyid == 0)
+    np.testing.assert_allclose(model.site_pos[site], state.task.goal, atol=1e-6)
+    assert model.camera("track").fovy[0] < render.build(env, state.physics).compile().camera("track").fovy[0]
+
+
+def test_markers_are_what_the_robot_is_told_to_reach(jitted):
+    """Pedipulation's is the commanded point, which the showcase holds fixed; a walker has none."""
+    env = jitted("anymal_pedipulation", **envs.TASKS["anymal_pedipulation"][0].SHOWCASE_FIELDS).env
+    state = jax.jit(env.reset)(jax.random.key(0))
+    np.testing.assert_allclose(env.markers(state.task), [[0.7, -0.2, 0.5]], atol=1e-6)
+    walker = jitted("go1_loco").env
+    assert walker.markers(None).shape == (0, 3)
 
 
 def test_films_that_cannot_be_written(tmp_path, refused, monkeypatch):

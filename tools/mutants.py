@@ -147,7 +147,87 @@ FAULTS = {  # (file, tests, words for -k) -> faults: name, old text, new text
         ("a mirror of the wrong sign", 'AXIAL = {"left_right": np.array([-1,', 'AXIAL = {"left_right": np.array([1,'),
     ],
     ("envs/locomotion.py", "test_envs", "changes_when_due"): [
-        ("a command for ever", "due = clock % self.command_steps == 0", "due = False"),
+        ("a command for ever", "select(task.remaining <= 0,", "select(False,"),
+    ],
+    ("envs/locomotion.py", "test_envs", "that_was_set"): [
+        ("a command that was set expires", "remaining=forever", "remaining=task.remaining"),
+        ("a command that was set is steered", "steers=~yes", "steers=task.steers"),
+    ],
+    ("envs/locomotion.py", "test_envs", "shares_and_ranges"): [
+        ("who turns on the spot walks", "jnp.where(on_the_spot, 0.0, velocity)", "velocity"),
+        ("turns on the spot count as turns", "kind >= c.on_the_spot + c.turning", "kind >= c.turning"),
+    ],
+    ("envs/locomotion.py", "test_envs", "not_steered"): [
+        ("a heading steers every command", "jnp.where(task.steers, turn, task.command[2])", "turn"),
+    ],
+    ("envs/locomotion.py", "test_envs", "low_passed"): [
+        ("no low-pass", "task.velocity + share * (", "self.tracked_velocity(motion) + 0 * ("),
+        ("a low-pass of one second", "min(1.0, self.dt / self.config.tracking_seconds)", "self.dt"),
+    ],
+    ("envs/locomotion.py", "test_envs", "half_a_step_apart and g1"): [
+        ("feet in one beat", "jnp.array(self.robot.gait)", "0 * jnp.array(self.robot.gait)"),
+        ("a clock that asks who stands for steps", "(share >= swing) | ~moves", "(share >= swing)"),
+    ],
+    ("envs/locomotion.py", "test_envs", "next_reward"): [
+        ("a phase while standing", "jnp.cos(angle)]) * rewards.moving(task.command)", "jnp.cos(angle)])"),
+    ],
+    ("envs/rewards.py", "test_envs", "half_a_step_apart and g1"): [
+        ("turning on the spot is standing", " | (jnp.abs(command[2]) > 0.1)", ""),
+    ],
+    ("envs/rewards.py", "test_rewards", "rollout and g1_loco"): [
+        ("power that motors take is free", "jnp.abs(torque * joint_vel)", "jnp.maximum(torque * joint_vel, 0)"),
+        ("impact of half the weight", "/ weight - 1.5,", "/ weight - 0.5,"),
+        ("feet of any height", "/ 0.05**2)", "/ 0.5**2)"),
+        ("both feet or none in step", "jnp.mean(contact == stance)", "jnp.all(contact == stance)"),
+    ],
+    ("envs/base.py", "test_envs", "late_actions"): [
+        ("actions are never late", "self.action_scale * mixed", "self.action_scale * action"),
+        ("delays in whole steps", "(1 - older) * actions[whole] + older * actions[whole + 1]", "actions[whole]"),
+        ("delays from the oldest action", "action[None]])[::-1]", "action[None]])"),
+    ],
+    ("envs/base.py", "test_envs", "late_readings"): [
+        ("readings are never late", "now + state.lag * (state.readings[name] - now)", "now"),
+        ("readings as late as the episode", "readings=readings,", "readings=state.readings,"),
+    ],
+    ("envs/base.py", "test_envs", "drawn_in_their"): [
+        (
+            "one strength for all motors",
+            "*c.motor_strength, (self.action_dim,))",
+            "*c.motor_strength) * jnp.ones(self.action_dim)",
+        ),
+        ("delays in seconds", "*self.config.action_delay) / self.dt", "*self.config.action_delay)"),
+    ],
+    ("envs/base.py", "test_envs", "seen_mirrored and g1"): [
+        ("a mirror image in the same beat", '"phase": np.array([-1, -1])', '"phase": np.array([1, 1])'),
+    ],
+    ("envs/engine.py", "test_envs", "weak_motors"): [
+        ("motors of one strength", "m.actuator_gainprm * strength[", "m.actuator_gainprm + 0 * strength["),
+        ("a weak motor's other zero", "m.actuator_biasprm * strength[", "m.actuator_biasprm + 0 * strength["),
+    ],
+    ("envs/engine.py", "test_envs", "friction_is_that"): [
+        (
+            "joints that never rub",
+            "xp.maximum(joint_friction[..., None], 1e-6)",
+            "1e-6 + 0 * joint_friction[..., None]",
+        ),
+    ],
+    ("envs/engine.py", "test_envs", "reach_the_engine and mjx"): [
+        ("joints without friction held", "xp.maximum(joint_friction[..., None], 1e-6)", "joint_friction[..., None]"),
+    ],
+    ("envs/robots.py", "test_envs", "joint_by_joint"): [
+        ("one scale for all joints", "action_scale=G1_SCALE", "action_scale=(0.5,) * 29"),
+    ],
+    ("envs/__init__.py", "test_scripts", "cannot_be_set"): [
+        ("any text turns --robust on", "if not isinstance(robust, bool):", "if False:"),
+    ],
+    ("ppo_finetune.py", "test_scripts", "set_reaches"): [
+        ("--robust is not heard", "partial(envs.make, robust=args.robust)", "envs.make"),
+    ],
+    ("play.py", "test_scripts", "set_reaches"): [
+        ("a policy forgets its robust set", 'meta["args"].get("robust", False)', "False"),
+    ],
+    ("tools/play_onnx.py", "test_envs", "next_reward"): [
+        ("a robot's clock that stands", "np.sin(angle), np.cos(angle)", "0, 1"),
     ],
     ("envs/parkour.py", "test_parkour", "promotion"): [
         ("a level is never lost", "task.level + success - failure", "task.level + success"),
