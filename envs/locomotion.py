@@ -365,7 +365,7 @@ G1_LOCO = LocomotionConfig(
     turning=0.4,
     on_the_spot=0.1,
     tracking_seconds=0.3,
-    gait_hz=1.5,
+    gait_hz=2.0,
     swing_height=0.1,
     effort_joints=("hip", "knee"),
     # Deviation (G1 contacts): Any part but the feet ends the episode, not the torso alone. Else it learns to sit.
