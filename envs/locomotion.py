@@ -270,7 +270,7 @@ ANYMAL_LOCO = LocomotionConfig(
     weights=ANYMAL_WEIGHTS,
     robust=ROBUST_QUADRUPED
     | {
-        "weights": ANYMAL_WEIGHTS | STEPS,
+        "weights": ANYMAL_WEIGHTS | STEPS | {"slip": -1.0, "torque": -2.5e-5},
         "added_mass": (-5.0, 10.0),
         "joint_friction": (0.0, 0.3),
     },

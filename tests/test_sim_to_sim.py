@@ -240,6 +240,30 @@ def test_a_foot_is_where_its_ball_is(tmp_path):
 # --- Physics ---
 
 
+def test_weight_on_the_knees_is_told_from_weight_on_the_feet(ours):
+    """A robot that kneels with its feet up, and one that stands; a robot told to stand does not count."""
+    weight, command = ours.model.body_mass.sum() * 9.81, np.full((75, 1, 3), 0.5)
+    kneeling = sim_to_sim.drive(ours, Fake(lambda inputs: np.tile([0, 0, -2.7] * 4, (1, 1))), command)
+    standing = sim_to_sim.drive(ours, Fake(stand), command)
+    assert kneeling.alive.all() and kneeling.foot_pos[-1, ..., 2].min() > 0.023
+    assert kneeling.off_feet[-10:].mean() == pytest.approx(weight, rel=0.02)
+    assert 0.5 < kneeling.leaning(weight) < 1.1 and standing.leaning(weight) == pytest.approx(0, abs=1e-6)
+    assert sim_to_sim.part(kneeling, 0, 1).leaning(weight) == kneeling.leaning(weight)
+    assert sim_to_sim.drive(ours, Fake(stand), 0 * command[:2]).leaning(weight) is None
+
+
+def test_a_model_of_which_only_the_feet_touch_the_ground_is_named(tmp_path, ours):
+    """As Playground's: the same kneeling robot sinks in, and the tool says why."""
+    text = re.sub(r'name="(\w+_c)"', r'name="\1" contype="0"', GO1.xml.read_text())
+    text = re.sub(r'name="(\w+_foot_c)" contype="0"', r'name="\1"', text)
+    (tmp_path / "feet.xml").write_text(text)
+    robot = sim_to_sim.load_robot(tmp_path / "feet.xml", FACTS)
+    kneel = Fake(lambda inputs: np.tile([0, 0, -2.7] * 4, (1, 1)))
+    assert not sim_to_sim.drive(robot, kneel, np.full((75, 1, 3), 0.5)).alive[-1].any()
+    lines = ["only its feet touch" in " ".join(sim_to_sim.introduce(r, ours, FACTS)) for r in (robot, ours)]
+    assert lines == [True, False]
+
+
 def test_motors_are_explicit_pd_with_a_limit_on_the_whole_torque(ours):
     """Equal to torques computed here at every 2 ms; also where the limit bites."""
     m, without = ours.model, copy.deepcopy(ours.model)

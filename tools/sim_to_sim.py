@@ -204,6 +204,7 @@ class Foot:
 
     body: str
     place: np.ndarray  # (3,) in the body's frame
+    shapes: list  # names of its geoms
     sole: float  # [m] height above the ground
 
 
@@ -279,7 +280,7 @@ def find_feet(model, joints, pose, ends, path):
         middle = data.geom_xpos[touching].mean(0)
         end = joint_above(model, body, [joints[i] for i in ends])
         place = data.xmat[body].reshape(3, 3).T @ (middle - data.xpos[body])
-        feet[end] = Foot(model.body(body).name, place, middle[2] - low[body])
+        feet[end] = Foot(model.body(body).name, place, [model.geom(g).name for g in like], middle[2] - low[body])
     if feet.keys() != set(range(len(ends))):
         names = ", ".join(model.body(body).name for body in lowest)
         raise records.UserError(f"{path}: its lowest bodies, {names}, are not the feet of the policy's robot")
@@ -287,7 +288,7 @@ def find_feet(model, joints, pose, ends, path):
 
 
 def add_sensors(spec, feet, base):
-    """Position, velocity and force of each foot, and the force of the ground on the base."""
+    """Position, velocity and force of each foot, and the force of the ground on the base, the robot and the soles."""
     site, body = mujoco.mjtObj.mjOBJ_SITE, mujoco.mjtObj.mjOBJ_BODY
     for i, foot in enumerate(feet):
         spec.body(foot.body).add_site(name=f"foot {i}", pos=foot.place)
@@ -295,6 +296,9 @@ def add_sensors(spec, feet, base):
             spec.add_sensor(name=f"{kind} {i}", type=sensor, objtype=site, objname=f"foot {i}")
         add_force(spec, f"force {i}", mujoco.mjtObj.mjOBJ_XBODY, foot.body)
     add_force(spec, "force base", body, base)
+    add_force(spec, "force all", mujoco.mjtObj.mjOBJ_XBODY, base)
+    for i, shape in enumerate(shape for foot in feet for shape in foot.shapes):
+        add_force(spec, f"sole {i}", mujoco.mjtObj.mjOBJ_GEOM, shape)
 
 
 def add_force(spec, sensor, kind, name):
@@ -332,6 +336,15 @@ class Robot:
         """Indices (len(names), 3) of these sensors into the sensor values."""
         return np.array([self.model.sensor(name).adr[0] + np.arange(3) for name in names])
 
+    def off_feet(self, sensors):
+        """Upward force (N,) of the ground on all but the feet's own shapes [N], from sensor values (N, S)."""
+        return sensors[:, self.sensor("force all")[0, 2]] - sensors[:, self.soles()[:, 2]].sum(1)
+
+    def soles(self):
+        """Indices (G, 3) of the sensors of the force on each shape of the feet."""
+        names = [self.model.sensor(i).name for i in range(self.model.nsensor)]
+        return self.sensor(*(name for name in names if name.startswith("sole ")))
+
     def feet_sensor(self, kind):
         """Indices (F, 3) of the feet's sensors of a kind: pos, vel or force."""
         return self.sensor(*(f"{kind} {i}" for i in range(len(self.feet))))
@@ -365,6 +378,8 @@ def load_robot(path, facts, timestep=0.002):
         raise records.UserError(f"{path} has no joint for {', '.join(missing)}; it has {', '.join(found) or 'none'}")
     for i, body in enumerate(spec.bodies):
         body.name = body.name or f"body {i}"
+    for i, geom in enumerate(spec.geoms):
+        geom.name = geom.name or f"geom {i}"
     try:
         strip(spec, path)
         base = free_base(spec, path, names)
@@ -392,6 +407,11 @@ def unlike(robot, ours):
     moved = np.linalg.norm((a.xanchor[i] - a.qpos[:3]) - (b.xanchor[j] - b.qpos[:3]), axis=1) > 0.02
     turned = (a.xaxis[i] * b.xaxis[j]).sum(1) < 0.98
     return [name for name, other in zip(robot.names, moved | turned, strict=True) if other]
+
+
+def feet_only(robot):
+    """True if no shapes but the feet's own touch the ground."""
+    return len(solid_geoms(robot.model)) == len(robot.soles())
 
 
 def without_armature(robot, ours):
@@ -460,6 +480,18 @@ def phase_of(facts, command, seconds):
 
 
 # --- Driving ---
+
+
+@dataclass
+class Drive(gait.Recording):
+    """A recording that also tells what parts other than the feet bear."""
+
+    off_feet: np.ndarray  # (T, N) upward force on them [N]
+
+    def leaning(self, weight):
+        """Share of the weight [N] on parts other than the feet while told to move; None if never."""
+        on = self.alive & self.command.any(-1)
+        return float(self.off_feet[on].mean() / weight) if on.any() else None
 
 
 def turns(qpos):
@@ -535,8 +567,8 @@ def drive(robot, policy, command, seed=0):
         qpos[~alive], qvel[~alive] = still[~alive], 0.0
         seen = np.where(alive[:, None], sensors, 0.0)
         rows.append(row(robot, qpos, qvel, seen, np.where(alive[:, None], torque, 0.0)) | {"alive": alive.copy()})
-        rows[-1]["action"] = action.copy()
-    return gait.Recording(facts["dt"], command, **{name: np.array([r[name] for r in rows]) for name in rows[0]})
+        rows[-1] |= {"action": action.copy(), "off_feet": robot.off_feet(seen)}
+    return Drive(facts["dt"], command, **{name: np.array([r[name] for r in rows]) for name in rows[0]})
 
 
 def row(robot, qpos, qvel, sensors, torque):
@@ -562,7 +594,7 @@ def row(robot, qpos, qvel, sensors, torque):
 def part(recording, begin, end):
     """The episodes from `begin` to before `end` of a recording."""
     cut = {name: x[:, begin:end] for name, x in vars(recording).items() if name != "dt"}
-    return gait.Recording(recording.dt, **cut)
+    return Drive(recording.dt, **cut)
 
 
 def assess(robot, policy, count, seconds):
@@ -576,7 +608,7 @@ def assess(robot, policy, count, seconds):
         done += plan.shape[1]
         if name == "reverse":
             by_command[name]["reversed"] = gait.reversals(here)
-    return by_command, gait.summary(by_command)
+    return by_command, gait.summary(by_command) | {"off_feet": recording.leaning(9.81 * body.mass)}
 
 
 # --- Main ---
@@ -617,6 +649,8 @@ def introduce(robot, ours, facts):
         yield f"joints that the policy does not know, held at 0: {', '.join(robot.fixed)}"
     if unlike(robot, ours):
         yield f"these joints lie or turn elsewhere than in ours: {', '.join(unlike(robot, ours))}"
+    if feet_only(robot):
+        yield "only its feet touch the ground: knees and shins sink into it, and a policy that leans on them falls"
     bare = without_armature(robot, ours).sum()
     if bare:
         yield f"{bare} of {len(robot.names)} joints have no armature (rotor inertia); --armature gives them ours"
@@ -636,6 +670,8 @@ def run(args):
         by_command, summary = assess(which, policy, args.starts, args.seconds)
         report[name] = {"path": which.path, "commands": by_command, "summary": summary}
         print(f"\n{name}: {which.path}\n{gait.lines(by_command, summary)}", flush=True)
+        if summary["off_feet"] is not None:
+            print(f"  weight on knees, shins and the like while told to move: {summary['off_feet']:.1%}", flush=True)
     print("\n" + side_by_side({name: found["summary"] for name, found in report.items()}))
     if args.json:
         for found in report.values():
