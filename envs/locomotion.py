@@ -69,6 +69,7 @@ class Locomotion(Env):
         self.effort = joint_indices(self.robot, *config.effort_joints)
         self.weight = 9.81 * float(self.model.body_mass.sum())  # [N]
         self.soft_limits = soft_limits(self.model, 0.8)
+        self.height = self.robot.sole - float(self.feet_in_base(self.default_pose)[:, 2].min())  # [m] of the base
 
     def init_task(self, key, physics, course):
         motion = self.motion(physics)
@@ -158,6 +159,7 @@ class Locomotion(Env):
             "stand_still": jnp.sum(jnp.abs(m.joint_pos)) * ~rewards.moving(task.command),
             "stand_on_feet": jnp.sum(~m.foot_contact) * ~rewards.moving(task.command),
             "joint_limits": rewards.beyond(m.joint_pos + self.default_pose, *self.soft_limits),
+            "height": rewards.square(m.base_pos[2] / self.height - 1),
             "pose": rewards.square(m.joint_pos),
             "alive": jnp.ones(()),
         }
@@ -244,6 +246,8 @@ STEPS = {  # high, even steps with feet that do not slide, and rest where the co
     "air_time": 0.0,
     "action_rate": -0.02,
     "joint_limits": -5.0,
+    "height": -30.0,  # without it quadrupeds crouch, and Go1 walks on its knees
+    "pose": -0.3,
     "stand_still": -0.2,
     "stand_on_feet": -1.0,
     "alive": 0.5,
@@ -270,7 +274,7 @@ ANYMAL_LOCO = LocomotionConfig(
     weights=ANYMAL_WEIGHTS,
     robust=ROBUST_QUADRUPED
     | {
-        "weights": ANYMAL_WEIGHTS | STEPS | {"slip": -1.0, "torque": -2.5e-5},
+        "weights": ANYMAL_WEIGHTS | STEPS | {"torque": -2.5e-5},
         "added_mass": (-5.0, 10.0),
         "joint_friction": (0.0, 0.3),
     },
