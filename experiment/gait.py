@@ -208,9 +208,13 @@ def feet(r, rows, body):
 
 
 def trunk(r, rows):
-    """Standard deviation over time of the base's height and tilt, mean of the episodes."""
-    whole = {"height_std": r.height, "roll_std": r.roll, "pitch_std": r.pitch}
-    return {name: mean([x[rows[:, n], n].std() for n in np.flatnonzero(rows.any(0))]) for name, x in whole.items()}
+    """Mean height of the base, and standard deviations over time of its height and tilt, mean of the episodes.
+
+    The height shows a robot that crouches, or walks on knees that the sensors of its feet cover.
+    """
+    whole, seen = {"height_std": r.height, "roll_std": r.roll, "pitch_std": r.pitch}, np.flatnonzero(rows.any(0))
+    spread = {name: mean([x[rows[:, n], n].std() for n in seen]) for name, x in whole.items()}
+    return spread | {"height": mean([r.height[rows[:, n], n].mean() for n in seen])}
 
 
 def effort(r, rows, body):
@@ -273,7 +277,16 @@ def summary(by_command, robustness=None):
         "velocity_error": mean([x["velocity_error"] for x in of]),
         "turning_error": mean([x["turning_error"] for x in of]),
     }
-    names = ("stride_frequency", "duty", "duty_difference", "clearance", "slip", "cost_of_transport", "fast_action")
+    names = (
+        "height",
+        "stride_frequency",
+        "duty",
+        "duty_difference",
+        "clearance",
+        "slip",
+        "cost_of_transport",
+        "fast_action",
+    )
     result |= {name: usual[name] for name in names}
     highest = ("torque_peak", "torque_max", "torque_rms", "foot_force")
     result |= {name: worst(of, name) for name in highest} | {"joint_margin": -worst(of, "joint_margin", -1)}
@@ -311,6 +324,7 @@ COLUMNS = {  # heading -> number, its factor and format
     "strides/s": ("stride_frequency", 1, ".1f"),
     "slip": ("slip", 1, ".2f"),
     "still%": ("still", 100, ".0f"),
+    "height": ("height", 1, ".2f"),
     "tilt": ("pitch_std", 180 / np.pi, ".1f"),
     "torque": ("torque_peak", 1, ".2f"),
     "rms": ("torque_rms", 1, ".2f"),

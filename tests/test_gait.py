@@ -67,10 +67,10 @@ def test_feet_of_a_known_gait():
 
 
 def test_effort_of_a_known_gait():
-    """Faults: negative work counted as positive, a torque over the wrong joint's limit, the margin of one side only."""
+    """Faults: negative work counted, a torque over the wrong joint's limit, the margin of one side only, no height."""
     m = gait.measure(walk(), BODY)
     close(m, cost_of_transport=10 * 2 / (BODY.mass * gait.GRAVITY * 0.5), torque_peak=0.5, torque_max=0.5)
-    close(m, torque_rms=0.5, joint_margin=0.3, height_std=0.01, roll_std=0.0, fast_action=0.0)
+    close(m, torque_rms=0.5, joint_margin=0.3, height=0.3, height_std=0.01, roll_std=0.0, fast_action=0.0)
     r = walk()
     r.torque[300, 1] = [0, -100]
     r.joint_pos[300:305] = [-1.1, 0]
