@@ -78,6 +78,7 @@ def feet_of(path, spec, body, shapes, wishes):
         "gait": gait([site[:2] for site in sites]),
         "contact_ends": ends,
         "height": -ground,
+        "span": np.linalg.norm(np.ptp(sites, 0)[:2]),  # of the feet
         "mass": model.body_mass.sum(),
         "base_mass": model.body_mass[1],
     }

@@ -86,7 +86,7 @@ def load(path):
         average(new, body, notes)
     body |= feet_of(path, new, body, shapes, wishes)
     body |= mirrors_of(new, body, notes)
-    equip(path, new, body, shapes, wishes)
+    equip(path, new, body)
     body |= {"mjcf": new.to_xml(), "notes": notes}
     return rounded(body | measures(body) | {"digest": digest(body)})
 
@@ -506,12 +506,13 @@ def copy_body(model, b, parent, body, is_root):
     return new
 
 
-def equip(path, spec, body, shapes, wishes):
+def equip(path, spec, body):
     """Add the feet's sites, the camera and the sensors; contact sensors come last."""
     sensor, site, kind = mujoco.mjtSensor, mujoco.mjtObj.mjOBJ_SITE, mujoco.mjtSensor.mjSENS_CONTACT
-    far, trunk = 3 * body["height"] + 0.3, spec.body(body["base"])
-    camera = trunk.add_camera(name="track", mode=mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM, pos=[0, -far, 0.27 * far])
-    camera.alt.xyaxes = [1, 0, 0, 0, 0.27, 1]
+    far, trunk = 2 * body["height"] + 0.9 * body["span"] + 0.3, spec.body(body["base"])
+    look = mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM
+    tilt = np.arctan2(1.0, 0.27) / 2  # from the right side, a little from above
+    trunk.add_camera(name="track", mode=look, pos=[0, -far, 0.27 * far], quat=[np.cos(tilt), np.sin(tilt), 0, 0])
     for foot, owner, pos in zip(body["feet"], body["foot_bodies"], body["foot_sites"], strict=True):
         spec.body(owner).add_site(name=foot, pos=pos, group=4, size=[0.01, 0.01, 0.01])
         spec.add_sensor(name=f"{foot}_pos", type=sensor.mjSENS_FRAMEPOS, objtype=site, objname=foot)
