@@ -202,14 +202,16 @@ def joint_images(model, data, reflection, images, body):
 
 
 def average(spec, body, notes):
-    """Average masses and inertias over each symmetry, so that mirrored motion is exact."""
+    """Average masses, inertias and gains over each symmetry, so that mirrored motion is exact."""
     for name, reflection in REFLECTIONS.items():
         model, data = posed(spec, np.zeros(len(body["joints"])))
         data.qpos[7:] = model.qpos0[7:]
         mujoco.mj_kinematics(model, data)
         images, _ = body_images(model, data, reflection)
-        if not images or not joint_images(model, data, reflection, images, body):
+        table = images and joint_images(model, data, reflection, images, body)
+        if not table:
             continue
+        average_gains(spec, body, table)
         turns = data.ximat.reshape(-1, 3, 3)
         inertia = np.einsum("bij,bj,bkj->bik", turns, model.body_inertia, turns)  # world axes
         for b in range(1, model.nbody):
@@ -221,4 +223,16 @@ def average(spec, body, notes):
             mujoco.mju_eig3(values, vectors, quat, mean.ravel())
             one.mass, one.ipos = model.body_mass[[b, other]].mean(), turn.T @ (centre - data.xpos[b])
             one.inertia, one.iquat = values, quat
-        notes.append(f"masses and inertias are averaged over {name.replace('_', '-')}")
+        notes.append(f"masses, inertias and gains are averaged over {name.replace('_', '-')}")
+
+
+def average_gains(spec, body, table):
+    """Average the motors of mirrored joints, and the angles they hold."""
+    perm, signs = table["joints"], np.array(table["signs"])
+    for name in ("kp", "kd", "torque_limit", "action_scale"):
+        body[name] = (np.array(body[name]) + np.array(body[name])[perm]) / 2
+    body["default_pose"] = (np.array(body["default_pose"]) + signs * np.array(body["default_pose"])[perm]) / 2
+    for i, joint in enumerate(body["joints"]):
+        limit, motor = body["torque_limit"][i], spec.actuator(joint)
+        spec.joint(joint).damping, motor.forcerange = [body["kd"][i], 0, 0], [-limit, limit]
+        motor.set_to_position(kp=body["kp"][i])
