@@ -54,7 +54,7 @@ def load_policy(path, engine="auto", overrides=(), **fields):
     params, meta = records.load(Path(path), "policy")
     trained = {name: meta["args"].get(name) for name in ("network", "init_std", "hidden", "intention")}
     args = ppo_finetune.Args(task=meta["task"], engine=engine, set=tuple(overrides), **trained)
-    make = partial(envs.make, robust=meta["args"].get("robust", False))
+    make = partial(envs.make, robust=meta["args"].get("robust", False), robot=meta.get("body"))
     env = make_env(make, args.task, args, **typed(meta["args"].get("set", ())) | fields)
     net = ppo_finetune.make_net(args, env)
     state = jax.eval_shape(env.reset, jax.random.key(0))
@@ -66,9 +66,9 @@ def load_policy(path, engine="auto", overrides=(), **fields):
 def load(args, kind="EVALUATION_FIELDS", **fields):
     """`load_policy` of the arguments, in the task's environment for an evaluation or, SHOWCASE_FIELDS, for pictures."""
     _, meta = records.load(Path(args.policy), "policy")
-    if meta["task"] not in envs.TASKS:
+    family = envs.family(meta["task"])
+    if family is None:
         raise records.UserError(f"{args.policy} is a policy for {meta['task']!r}; known are {', '.join(envs.TASKS)}")
-    family, _ = envs.TASKS[meta["task"]]
     if args.level is not None and not 0 <= args.level < family.LEVELS:
         known = f"choose 0 to {family.LEVELS - 1}" if family.LEVELS else "leave out --level"
         raise records.UserError(f"{meta['task']} has no level {args.level}; {known}")

@@ -33,7 +33,7 @@ class Args:
     """A field left at None is filled in from the preset or the robot. The merged set is printed and saved."""
 
     # --- Experiment ---
-    robot: str = "go1"  # a name in envs.EXPLORE
+    robot: str = "go1"  # a name in envs.EXPLORE, or an MJCF or URDF file
     preset: Literal["smoke", "cpu", "gpu"] = "cpu"  # scale: 4, 256 or 4096 environments
     seed: int = 0  # the only source of randomness
     engine: str = "auto"  # physics: c (CPU threads), mjx (accelerators), warp (NVIDIA)
@@ -95,7 +95,7 @@ def merge(args, ppo):
     """Fill the fields left at None from the preset and the robot's settings `ppo`, and check the result."""
     values = PRESETS[args.preset] | {"hidden": ppo["hidden"], "init_std": ppo["init_std"]}
     values |= {"entropy_coef": ppo["entropy"], "shuffle_blocks": jax.device_count()}
-    values |= {"run_dir": f"runs/explore/{args.robot}/seed{args.seed}"}
+    values |= {"run_dir": f"runs/explore/{envs.label(args.robot)}/seed{args.seed}"}
     args = records.check_minibatches(records.filled(args, values))
     if not 0 < args.validation < 1 or num_held_out(args) == args.num_envs:
         raise records.UserError(

@@ -35,7 +35,8 @@ class Args:
     """A field left at None is filled in from the preset or the task. The merged set is printed and saved."""
 
     # --- Experiment ---
-    task: str = "go1_loco"  # a name in envs.TASKS
+    task: str = "go1_loco"  # a name in envs.TASKS, or loco with --robot
+    robot: str | None = None  # MJCF or URDF file of the robot of --task loco; or a run's args.json
     network: Literal["mlp", "pidm"] | None = None  # of actor and critic; None: pidm with --pretrained, else mlp
     pretrained: str | None = None  # PIDM checkpoint written by pretrain_pidm.py
     policy: str | None = None  # start from actor and critic of this policy.msgpack, e.g. to make it robust
@@ -99,7 +100,7 @@ def merge(args, ppo):
     loaded = "random" if not args.pretrained else "pretrained" if args.load_into == "both" else args.load_into
     method = "mlp" if network == "mlp" else f"pidm_{loaded}"
     seed = f"/seed{args.seed}" * (args.num_seeds == 1)
-    values = {"network": network, "run_dir": f"runs/{args.task}/{method}{seed}"}
+    values = {"network": network, "run_dir": f"runs/{envs.label(args.task, args.robot)}/{method}{seed}"}
     values |= {"hidden": ppo["hidden"], "init_std": ppo["init_std"], "entropy_coef": ppo["entropy"]}
     values |= {"intention": ppo.get("intention"), "shuffle_blocks": jax.device_count()}
     values |= PRESETS[args.preset] | ppo.get(args.preset, {})
@@ -259,7 +260,7 @@ def make_net(args, env):
     """The actor-critic that the arguments ask for."""
     if args.network == "mlp":
         return ActorCritic(args.hidden, env.action_dim, args.init_std, args.weight_init)
-    sizes = SIZES[env.robot.name]
+    sizes = SIZES[env.robot.like]
     wide = args.intention or sizes["goal"][:-1]  # perceptive tasks need a wider intention encoder
     sizes = sizes | {"goal": (*wide, sizes["goal"][-1])}
     return PIDMActorCritic(sizes, env.prop_dim, env.action_dim, args.init_std, args.weight_init)
@@ -512,9 +513,8 @@ def init_state(args, env, net, opt):
     clocks = jax.random.randint(k_clock, (args.num_envs,), 0, env.episode_steps)
     env_state = jax.jit(jax.vmap(env.reset))(jax.random.split(k_env, args.num_envs), clocks)
     params = net.init(k_net, net.inputs(env_state.obs, env_state.history))
-    if args.network == "pidm":
-        params = warm_start(args, env, params, jax.random.fold_in(key, 1))
-    params = records.load_policy(args.policy, params) if args.policy else params
+    params = warm_start(args, env, params, jax.random.fold_in(key, 1)) if args.network == "pidm" else params
+    params = records.load_policy(args.policy, params, env) if args.policy else params
     return TrainState(params, opt.init(params), jnp.float32(args.lr), env_state, key, jnp.zeros((), jnp.int32))
 
 
@@ -532,7 +532,7 @@ def make_chunk(args, env, net, opt, states):
 
 def train(args):
     """Run PPO to the end, or to Ctrl-C or SIGTERM. Either way each seed's folder holds a policy, metrics and curve."""
-    env = make_env(partial(envs.make, robust=args.robust), args.task, args)
+    env = make_env(partial(envs.make, robust=args.robust, robot=args.robot), args.task, args)
     args = merge(args, env.config.ppo)
     net, opt = make_net(args, env), optax.scale_by_adam()  # `update` multiplies by the adapted step size
     run = Run(args, env.config, planned_iterations(args), SHOWN)

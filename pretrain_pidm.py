@@ -320,7 +320,7 @@ def pretrain(args):
     few = np.sort(np.random.default_rng(args.seed).permutation(data.validation)[:50_000])
     print(f"{robot}: {count} transitions to train on, {len(data.validation)} to validate")
 
-    net = PIDM(SIZES[robot], env.action_dim)
+    net = PIDM(SIZES[env.robot.like], env.action_dim)
     opt = optax.adam(optax.cosine_decay_schedule(args.lr, args.epochs * max(count // args.batch, 1)))
 
     def init(args):
@@ -342,7 +342,7 @@ def pretrain(args):
                 raise records.UserError(f"the error is not finite after epoch {epoch}; lower --lr")
             rows = run.rows[0]
             if folder and rows[-1]["error"] <= min(row["error"] for row in rows):
-                records.save(folder / "pidm.msgpack", state[0], checkpoint_meta(args, data, net.sizes, rows[-1]))
+                records.save(folder / "pidm.msgpack", state[0], checkpoint_meta(args, env, data, net.sizes, rows[-1]))
             run.save([state])
     run.report_interrupt()
     if folder:
@@ -357,7 +357,7 @@ def open_data(args):
     """The collection args.data and its robot's environment. UserError if they do not fit together."""
     data = Dataset(args.data)
     robot = data.meta["robot"]
-    env = envs.make_explore(robot, "c", history=data.meta["history"])
+    env = envs.make_explore(dataset.robot_of(data.meta), "c", history=data.meta["history"])
     if data.meta["layout"] != list(env.prop_layout):
         raise records.UserError(f"{args.data} has x = {data.meta['layout']}, not {list(env.prop_layout)}")
     for name, width in (("x", env.prop_dim), ("action", env.action_dim)):
@@ -367,11 +367,12 @@ def open_data(args):
     return data, env
 
 
-def checkpoint_meta(args, data, sizes, row):
+def checkpoint_meta(args, env, data, sizes, row):
     """Description of a PIDM checkpoint, stored in it."""
     meta = data.meta
     return {
         "robot": meta["robot"],
+        "body": env.config.body,
         "layout": meta["layout"],
         "history": meta["history"],
         "sizes": dict(sizes),
@@ -449,7 +450,7 @@ def run_validation(args):
     """Validate the PIDM of --eval on the collection --data. UserError if the two do not fit."""
     path = Path(args.eval)
     data, env = open_data(args)
-    net = PIDM(SIZES[env.robot.name], env.action_dim)
+    net = PIDM(SIZES[env.robot.like], env.action_dim)
     like = jax.eval_shape(partial(init_variables, args, env, net), data.windows(data.validation[:1]))
     validate(args, env, net, records.load_pidm(path, env, like), data, path.parent)
 

@@ -1,8 +1,10 @@
 """Robot tasks. `envs.make("go1_loco")` builds one of `envs.TASKS`; `envs.make_explore("go1")` is for exploration."""
 
+from pathlib import Path
+
 import jax
 
-from envs import gl, locomotion, parkour, pedipulation  # noqa: F401, gl comes before all that imports MuJoCo
+from envs import gl, loader, locomotion, newcomers, parkour, pedipulation  # noqa: F401, gl precedes all with MuJoCo
 from envs.config import FIXED, replace_checked
 from envs.explore import EXPLORE, Explore
 
@@ -28,17 +30,42 @@ TASKS = {
     "anymal_crouch": (parkour.Parkour, parkour.CROUCH),
     "anymal_jump": (parkour.Parkour, parkour.JUMP),
 }
+GENERIC = {"loco": (locomotion.Locomotion, newcomers.loco)}  # tasks of a robot from a file
 
 
-def make(task, engine="auto", /, robust=False, **overrides):
+def family(task):
+    """The class of a task's environments, or None for an unknown task."""
+    return (TASKS | GENERIC).get(task, (None,))[0]
+
+
+def body_of(robot):
+    """The body of a robot: of a file, see loader.py, or as a checkpoint holds it."""
+    return robot if isinstance(robot, dict) else loader.load(robot)
+
+
+def label(task_or_robot, robot=None):
+    """Name of a task or robot for folders: a file's is its stem, with the task if there is one."""
+    return f"{Path(robot).stem}_{task_or_robot}" if robot else Path(task_or_robot).stem
+
+
+def make(task, engine="auto", /, robust=False, robot=None, **overrides):
     """Build a task's environment. Overrides replace fields of its config, as in make("go1_loco", noise=0.0).
 
-    `robust` first replaces those of its config's set for use on a robot. ValueError for an unknown task, engine or
-    field, naming those that exist, for a value of a wrong type, and for `robust` where the task has no such set.
+    `robot` is the file (or body) of the robot of a task in GENERIC. `robust` first replaces the fields of its config's
+    set for use on a robot. ValueError for an unknown task, engine or field, naming those that exist, for a value of a
+    wrong type, for `robust` where the task has no such set, and for a robot that cannot be loaded.
     """
-    if task not in TASKS:
-        raise ValueError(f"unknown task {task!r}; choose one of {', '.join(TASKS)}")
-    family, config = TASKS[task]
+    if task in GENERIC and robot:
+        family, build = GENERIC[task]
+        config = build(body_of(robot))
+    elif task in GENERIC or robot:
+        raise ValueError(
+            f"--task {task} and --robot FILE go together" if robot else f"--task {task} needs --robot FILE"
+        )
+    elif task not in TASKS:
+        raise ValueError(f"unknown task {task!r}; choose one of {', '.join(TASKS | GENERIC)}")
+    else:
+        family, config = TASKS[task]
     if not isinstance(robust, bool):  # text after --set robust=
         raise ValueError(f"robust cannot be set: {FIXED['robust']}")
     if robust and not config.robust:
@@ -49,7 +76,8 @@ def make(task, engine="auto", /, robust=False, **overrides):
 
 
 def make_explore(robot, engine="auto", /, **overrides):
-    """Build a robot's exploration environment for stage 1. ValueError as for `make`."""
-    if robot not in EXPLORE:
-        raise ValueError(f"unknown robot {robot!r}; choose one of {', '.join(EXPLORE)}")
-    return Explore(replace_checked(EXPLORE[robot], overrides), engine)
+    """Build a robot's exploration environment for stage 1, of its name, file or body. ValueError as for `make`."""
+    if isinstance(robot, str) and robot not in EXPLORE and not Path(robot).suffix:
+        raise ValueError(f"unknown robot {robot!r}; choose one of {', '.join(EXPLORE)}, or a file")
+    config = newcomers.explore(body_of(robot)) if isinstance(robot, dict) or robot not in EXPLORE else EXPLORE[robot]
+    return Explore(replace_checked(config, overrides), engine)

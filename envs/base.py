@@ -12,6 +12,7 @@ import numpy as np
 
 from envs import terrain
 from envs.engine import RANDOMISED, Physics, make_engine
+from envs.loader import LoadedRobot
 from envs.robots import AXIAL, POLAR, ROBOTS
 from envs.rotations import axis_angle, inverse, multiply, rotate, yaw_of
 
@@ -144,7 +145,8 @@ class Env:
     COMMAND_RANGES: dict[str, tuple] = {}  # command of `set_command`: name -> (low, high)
 
     def __init__(self, config, engine="auto"):
-        self.config, self.robot = config, ROBOTS[config.robot]
+        self.config = config
+        self.robot = LoadedRobot.of(config.body) if config.body else ROBOTS[config.robot]
         self.dt = config.physics_dt * config.decimation  # [s] control step
         for name, most in (("action_delay", (config.history - 1) * self.dt), ("sensor_lag", self.dt)):
             if not 0 <= getattr(config, name)[0] <= getattr(config, name)[1] <= most:
@@ -477,19 +479,41 @@ class Env:
     # --- kinematics ---
 
     def leg_chains(self):
-        """Links from base to foot, each offset (F, 3), turn (F, 4), axis (F, 3), joint (F,); and the sites (F, 3)."""
+        """Links from base to foot, each offset (F, 3), turn (F, 4), axis (F, 3), joint (F,); and the sites (F, 3).
+
+        Where a leg has no joint, as at the end of one shorter than others, the joint is A, whose angle is 0.
+        """
+        sites = [self.model.site(foot) for foot in self.robot.feet]
+        chains = [self.chain(site.bodyid[0]) for site in sites]
+        none = np.zeros(3), np.array([1.0, 0, 0, 0]), np.array([0, 0, 1.0]), self.action_dim
+        chains = [chain + [none] * (max(map(len, chains)) - len(chain)) for chain in chains]
+        links = [tuple(map(np.array, zip(*link, strict=True))) for link in zip(*chains, strict=True)]
+        return links, np.array([site.pos for site in sites])
+
+    def chain(self, body):
+        """Links from the base to a body, each offset (3,), turn (4,), axis (3,) and joint."""
         m, links = self.model, []
-        sites = [m.site(foot) for foot in self.robot.feet]
-        body = np.array([site.bodyid[0] for site in sites])
-        while body[0] != 1:
-            joint = m.body_jntadr[body]
-            links.append((m.body_pos[body], m.body_quat[body], m.jnt_axis[joint], joint - 1))
+        straight, z = np.array([1.0, 0, 0, 0]), np.array([0, 0, 1.0])
+        while body != 1:
+            offset, turn, part = m.body_pos[body], m.body_quat[body], []
+            for joint in range(m.body_jntadr[body], m.body_jntadr[body] + m.body_jntnum[body]):
+                anchor = m.jnt_pos[joint]
+                if anchor.any():  # the body turns about this point of it
+                    offset = offset + np.array(rotate(turn, anchor))
+                part.append((offset, turn, m.jnt_axis[joint], joint - 1))
+                offset, turn = -anchor, straight
+            if not part or offset.any():
+                part.append((offset, turn, z, self.action_dim))
+            links = part + links
             body = m.body_parentid[body]
-        return links[::-1], np.array([site.pos for site in sites])
+        return links
 
     def feet_in_base(self, joints):
         """Foot sites (F, 3) in the base frame at joint angles (A,). At a reset no sensor has been read yet."""
         links, site = self.legs
+        rest = self.model.qpos0[7:]
+        if rest.any() or any((joint == self.action_dim).any() for *_, joint in links):
+            joints = jnp.append(joints - rest, 0.0)
         pos, quat = jnp.zeros_like(site), jnp.tile(jnp.array([1.0, 0, 0, 0]), (len(site), 1))
         for offset, turn, axis, joint in links:
             pos = pos + rotate(quat, offset)

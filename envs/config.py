@@ -21,6 +21,7 @@ class Config:
     weights: dict[str, float]  # reward term -> weight
     ppo: dict  # the task's own PPO settings, which ppo_finetune.py reads
     robust: dict = field(default_factory=dict)  # fields that --robust replaces, for use on a robot; {}: none
+    body: dict = field(default_factory=dict)  # of a robot from a file, see loader.py; {}: `robot` is a shipped one
     episode_seconds: float = 20.0
     physics_dt: float = 0.005  # [s]
     decimation: int = 4  # physics steps per control step
@@ -58,6 +59,7 @@ class Config:
 POSITIVE = ("episode_seconds", "physics_dt", "decimation", "history", "command_seconds", "perturb_seconds", "amplitude")
 FIXED = {
     "robot": "it belongs to the task",
+    "body": "it is what --robot FILE loads",
     "ppo": "PPO's settings are flags of their own, like --lr",
     "robust": "--robust turns it on as a whole",
 }

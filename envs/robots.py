@@ -7,6 +7,7 @@ Legend: A joints (and actions), F feet.
 from dataclasses import dataclass
 from pathlib import Path
 
+import mujoco
 import numpy as np
 
 ASSETS = Path(__file__).resolve().parent.parent / "assets"
@@ -35,6 +36,15 @@ class Robot:
     def xml(self):
         """Path of the MJCF."""
         return ASSETS / f"{self.name}.xml"
+
+    @property
+    def like(self):
+        """Name of the shipped robot whose networks fit this one."""
+        return self.name
+
+    def spec(self):
+        """MjSpec of the robot alone."""
+        return mujoco.MjSpec.from_file(str(self.xml))
 
     def exchange(self, mirror, name):
         """Name of the joint or foot that is the mirror image of `name`."""

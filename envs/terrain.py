@@ -13,7 +13,7 @@ import numpy as np
 
 def flat_scene(robot, visual=False):
     """MjSpec of a robot on a plane at z = 0; `visual` adds what only a renderer needs."""
-    spec = mujoco.MjSpec.from_file(str(robot.xml))
+    spec = robot.spec()
     world = spec.worldbody
     world.add_geom(
         name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 0.1], contype=0, conaffinity=1

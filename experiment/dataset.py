@@ -77,7 +77,7 @@ def finish(folder, arrays, args, env, iterations, held_out):
     """
     flush(arrays)
     meta = {
-        "robot": args.robot,
+        "robot": env.robot.name,
         "layout": list(env.prop_layout),
         "iterations": iterations,
         "num_steps": args.num_steps,
@@ -113,9 +113,15 @@ def read_meta(folder):
         intact = False
     if not intact:
         raise records.UserError(f"{path} is damaged; collect the data again")
-    if meta["robot"] not in envs.EXPLORE:
+    if robot_of(meta) == meta["robot"] and meta["robot"] not in envs.EXPLORE:
         raise records.UserError(f"{folder} holds robot {meta['robot']!r}; known are {', '.join(envs.EXPLORE)}")
     return meta
+
+
+def robot_of(meta):
+    """Name of a collection's robot, or the body of one that came from a file."""
+    config = meta.get("config")
+    return (config.get("body") if isinstance(config, dict) else None) or meta["robot"]
 
 
 def read_array(folder, name, meta):

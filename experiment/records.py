@@ -261,12 +261,13 @@ RESULTS = (
 )
 
 
-def load_policy(path, like):
+def load_policy(path, like, env):
     """Params of a policy file, but with the action std of `like`. UserError if it lacks the leaves and shapes of that.
 
-    A trained policy has a small std, with which it would hardly explore.
+    A trained policy has a small std, with which it would hardly explore. UserError also if it is of another body.
     """
-    params, _ = load(Path(path), "policy")
+    params, meta = load(Path(path), "policy")
+    check_body(path, meta, env)
     check_shapes(path, params, like)
     params = jax.tree.map(jnp.asarray, params)
     return params | {"params": params["params"] | {"log_std": like["params"]["log_std"]}}
@@ -281,9 +282,17 @@ def load_pidm(path, env, like):
     for name, here in (("robot", env.robot.name), ("layout", list(env.prop_layout)), ("history", env.config.history)):
         if meta[name] != here:
             raise UserError(f"{path} was made for {name} {meta[name]}, here is {name} {here}")
+    check_body(path, meta, env)
     parts = {kind: {name: x for name, x in content.get(kind, {}).items() if name in like[kind]} for kind in like}
     check_shapes(path, parts, like)
     return parts
+
+
+def check_body(path, meta, env):
+    """UserError if a checkpoint is of another body than the environment's robot, by their digests."""
+    theirs, ours = (body.get("digest", "none: a shipped robot") for body in (meta.get("body", {}), env.config.body))
+    if theirs != ours:
+        raise UserError(f"{path} was made for another body: its digest is {theirs}, here it is {ours}")
 
 
 def finite(tree):
@@ -340,6 +349,7 @@ def resumed(args, *may_change):
         names = record.keys() - {"config", "versions"}
         other = sorted(names ^ {field.name for field in fields})
         intact = bool(other) or all(fits(record[field.name], field.type) for field in fields)
+        from_file = bool(record.get("config", {}).get("body"))
     except OSError as error:
         raise UserError(f"cannot resume from {path}: {error.strerror}") from None
     except (ValueError, TypeError, AttributeError, RecursionError):
@@ -351,6 +361,7 @@ def resumed(args, *may_change):
             f"{path} is of another version or stage, which differs in {', '.join(other)[:99]}; start the run again"
         )
     found = {f.name: tuple(record[f.name]) if isinstance(record[f.name], list) else record[f.name] for f in fields}
+    found |= {"robot": str(path)} if from_file else {}  # the file may have changed since
     return type(args)(**found | given | {"resume": args.resume, "run_dir": args.resume, "force": False})
 
 

@@ -17,6 +17,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 
+from envs import loader
 from experiment import devices, figures, metrics, records
 from experiment.progress import Progress
 
@@ -70,6 +71,8 @@ class Run:
         They come last: `init` may raise a UserError, which must leave an older run as it is.
         """
         print("  ".join(f"{name}={value}" for name, value in dataclasses.asdict(self.args).items()), flush=True)
+        if self.config.body:
+            print("\n".join(loader.lines(self.config.body)), flush=True)
         if self.args.resume:
             records.claim(self.args.resume)
             state, self.rows[0] = records.load_state(self.args.resume, jax.eval_shape(lambda: init(self.args)))
@@ -148,7 +151,8 @@ class Run:
                     f"python tools/replay.py {args.run_dir}"
                 )
             if folder:
-                records.save(folder / "policy.msgpack", params, {"task": args.task, "args": dataclasses.asdict(args)})
+                meta = {"task": args.task, "args": dataclasses.asdict(args), "body": self.config.body}
+                records.save(folder / "policy.msgpack", params, meta)
         if self.due:
             self.save(unstack(states))
 

@@ -17,8 +17,9 @@ BUDGET = {  # lines, with blanks and docstrings
 STAGES = ("ppo_explore", "pretrain_pidm", "ppo_finetune")
 MODULES = {  # package -> its modules; each may import what stands before it
     "envs": (
-        *("gl", "rotations", "config", "robots", "terrain", "engine", "rewards", "base", "courses"),
-        *("locomotion", "explore", "pedipulation", "parkour", "render"),
+        *("gl", "rotations", "config", "robots", "anatomy", "loader", "terrain", "engine", "rewards", "base"),
+        "courses",
+        *("locomotion", "explore", "newcomers", "pedipulation", "parkour", "render"),
     ),
     "experiment": ("records", "devices", "metrics", "figures", "dataset", "progress", "run", "gait"),
 }

@@ -1,0 +1,371 @@
+"""Robots from files: what is derived of small MJCFs whose answers are known, and what is refused."""
+
+import json
+import time
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+import envs
+import ppo_finetune
+from envs import loader
+from envs.terrain import flat_scene
+from experiment import records
+from tools import check_robot
+
+SIDES = {"FL": (0.2, 0.1), "FR": (0.2, -0.1), "RL": (-0.2, 0.1), "RR": (-0.2, -0.1)}
+
+
+def leg(name, x, y, shape='<geom name="{0}_toe" type="sphere" size="0.02" pos="0 0 -0.2"/>', mass=0.2):
+    """A leg of a hip, a thigh of 0.2 m and a calf of 0.2 m with a round foot."""
+    return f"""
+    <body name="{name}_hip" pos="{x} {y} 0"><inertial pos="0 0 0" mass="0.5" diaginertia="1e-3 1e-3 1e-3"/>
+      <joint name="{name}_hip" axis="1 0 0" range="-0.8 0.8"/>
+      <body name="{name}_thigh" pos="0 {np.sign(y) * 0.05} 0">
+        <inertial pos="0 0 -0.1" mass="0.8" diaginertia="3e-3 3e-3 1e-3"/>
+        <joint name="{name}_thigh" axis="0 1 0" range="-1 3"/>
+        <geom type="capsule" size="0.02" fromto="0 0 -0.03 0 0 -0.17"/>
+        <body name="{name}_calf" pos="0 0 -0.2">
+          <inertial pos="0 0 -0.1" mass="{mass}" diaginertia="1e-3 1e-3 1e-4"/>
+          <joint name="{name}_calf" axis="0 1 0" range="-2.7 -0.5"/>
+          <geom type="capsule" size="0.01" fromto="0 0 -0.03 0 0 -0.15"/>
+          {shape.format(name)}
+        </body></body></body>"""
+
+
+def motors(names=SIDES, extra=""):
+    joints = [f"{name}_{part}" for name in names for part in ("hip", "thigh", "calf")]
+    return "<actuator>" + "".join(f'<motor joint="{j}" ctrlrange="-20 20" {extra}/>' for j in joints) + "</actuator>"
+
+
+def quadruped(legs=None, base="<freejoint/>", more=None, keys=None):
+    """MJCF of a robot with four legs; keyword arguments replace parts of it."""
+    legs = "".join(leg(name, x, y) for name, (x, y) in SIDES.items()) if legs is None else legs
+    qpos = "0 0 0.3 1 0 0 0" + " 0 0.8 -1.6" * 4
+    keys = f'<keyframe><key name="home" qpos="{qpos}"/></keyframe>' if keys is None else keys
+    return f"""<mujoco><compiler angle="radian" autolimits="true"/>
+    <worldbody><geom type="plane" size="5 5 1"/><body name="trunk" pos="0 0 0.3">{base}
+      <inertial pos="0 0 0" mass="6" diaginertia="0.02 0.06 0.07"/>
+      <geom name="trunk" type="box" size="0.2 0.08 0.05"/>{legs}</body></worldbody>
+    {motors() if more is None else more}{keys}</mujoco>"""
+
+
+def biped():
+    """MJCF of a robot with two legs, flat feet of four spheres, and position actuators in another order."""
+
+    def side(name, y):
+        balls = "".join(f'<geom size="0.01" pos="{x} {z} -0.04"/>' for x in (-0.05, 0.1) for z in (-0.03, 0.03))
+        return f"""<body name="{name}_thigh" pos="0 {y} -0.1"><joint name="{name}_hip" axis="0 1 0" range="-1 1"/>
+        <geom type="capsule" size="0.05" fromto="0 0 0 0 0 -0.4"/>
+        <body name="{name}_shin" pos="0 0 -0.4"><joint name="{name}_knee" axis="0 -1 0" range="-2 0.1"/>
+        <geom type="capsule" size="0.04" fromto="0 0 -0.1 0 0 -0.35"/>
+        <body name="{name}_foot" pos="0 0 -0.4"><joint name="{name}_ankle" axis="0 1 0" range="-1 1"/>
+        <inertial pos="0.02 0 -0.02" mass="0.5" diaginertia="1e-3 1e-3 1e-3"/>{balls}</body></body></body>"""
+
+    joints = [f"{s}_{part}" for s in ("left", "right") for part in ("hip", "knee", "ankle")]
+    moved = "".join(f'<position joint="{j}" kp="80" kv="3" forcerange="-60 50"/>' for j in reversed(joints))
+    return f"""<mujoco><compiler angle="radian" autolimits="true"/>
+    <worldbody><body name="pelvis" pos="0 0 1"><freejoint/>
+    <geom type="box" size="0.1 0.15 0.1" mass="8"/>{side("left", 0.1)}{side("right", -0.1)}</body></worldbody>
+    <actuator>{moved}</actuator>
+    <keyframe><key qpos="0 0 1 1 0 0 0 -0.2 -0.4 -0.2 -0.2 -0.4 -0.2"/></keyframe></mujoco>"""
+
+
+@pytest.fixture
+def write(tmp_path):
+    """write(text, toml="") -> path of an MJCF, with a robot.toml beside it."""
+
+    def to_file(text, toml="", name="dog.xml"):
+        (tmp_path / name).write_text(text)
+        (tmp_path / "robot.toml").write_text(toml)
+        return tmp_path / name
+
+    return to_file
+
+
+# --- what is derived ---
+
+
+def test_a_quadruped(write):
+    body = loader.load(write(quadruped()))
+    robot = loader.LoadedRobot.of(body)
+    assert robot.joints == tuple(f"{name}_{part}" for name in SIDES for part in ("hip", "thigh", "calf"))
+    assert robot.feet == tuple(f"{name}_calf_foot" for name in SIDES) and robot.sole == 0.02
+    assert robot.gait == (0.0, 0.5, 0.5, 0.0) and robot.like == "go1"
+    np.testing.assert_allclose(robot.default_pose, [0, 0.8, -1.6] * 4)
+    np.testing.assert_allclose(body["kp"], 20.0)  # the limit of 20 N m at 1 rad
+    np.testing.assert_allclose(robot.action_scale, 0.25)
+    np.testing.assert_allclose(body["height"], 0.4 * np.cos(0.8) + 0.02)
+    np.testing.assert_allclose(body["mass"], 6 + 4 * 1.5)
+    assert body["contact_ends"] == ["trunk", *(f"{name}_thigh" for name in SIDES)]
+    assert list(robot.mirrors) == ["left_right"]  # all knees bend the same way
+    perm, sign = robot.mirror_joints("left_right")
+    np.testing.assert_array_equal(perm, [3, 4, 5, 0, 1, 2, 9, 10, 11, 6, 7, 8])
+    np.testing.assert_array_equal(sign, [-1, 1, 1] * 4)
+    np.testing.assert_array_equal(robot.mirror_feet("left_right"), [1, 0, 3, 2])
+
+
+def test_damping_has_the_ratio_that_is_printed(write):
+    """kd of the rule, against the inertia of the links below a joint worked out by hand: the parallel-axis theorem."""
+    body = loader.load(write(quadruped()))
+    knee = 1e-3 + 0.2 * 0.1**2
+    np.testing.assert_allclose(body["kd"][2], 2 * 0.5 * np.sqrt(20 * knee), rtol=1e-6)
+    np.testing.assert_allclose(body["damping_ratio"], 0.5)
+
+
+def test_a_biped_keeps_the_gains_of_its_file(write):
+    body = loader.load(write(biped(), name="walker.xml"))
+    robot = loader.LoadedRobot.of(body)
+    assert robot.joints[:3] == ("left_hip", "left_knee", "left_ankle")  # of the tree, the actuators are reversed
+    assert any("order" in note for note in body["notes"])
+    assert set(body["kp"]) == {80.0} and set(body["kd"]) == {3.0} and set(body["torque_limit"]) == {50.0}
+    np.testing.assert_allclose(robot.action_scale, 0.25 * 50 / 80)
+    assert robot.feet == ("left_foot", "right_foot") and robot.gait == (0.0, 0.5)
+    assert body["contact_ends"] == ["pelvis", "left_thigh", "right_thigh"]  # shins stand close to the ground
+    np.testing.assert_allclose(body["foot_sites"][0], [0.025, 0, -0.04], atol=1e-9)  # between the four spheres
+    perm, sign = robot.mirror_joints("left_right")
+    np.testing.assert_array_equal(perm, [3, 4, 5, 0, 1, 2])
+    np.testing.assert_array_equal(sign, 1)
+
+
+def test_robot_toml_goes_before_the_file(write):
+    toml = """kp = { calf = 40.0, RR_calf = 50.0 }
+    kd = 1.5
+    action_scale = 0.3
+    contact_ends = ["trunk"]
+    pose = { RL_thigh = 1.0 }"""
+    body = loader.load(write(quadruped(), toml))
+    np.testing.assert_allclose(body["kp"][:3], [20, 20, 40])
+    assert body["kp"][11] == 50 and body["kd"] == [1.5] * 12 and body["action_scale"] == [0.3] * 12
+    assert body["gains_from"][:3] == ["rule", "rule", "robot.toml"]
+    assert body["default_pose"][6:9] == [0.0, 1.0, -1.6] and body["contact_ends"] == ["trunk"]
+    assert body["mirrors"] == {} and any("no symmetry" in note for note in body["notes"])
+
+
+def test_masses_are_averaged_on_request(write):
+    """A calf that is 3 % too heavy spoils the mirror image; averaging mends it and keeps the mass."""
+    legs = "".join(leg(n, x, y, mass=0.206 if n == "FL" else 0.2) for n, (x, y) in SIDES.items())
+    errors, masses = [], []
+    for toml in ("", "average = true"):
+        body = loader.load(write(quadruped(legs), toml))
+        robot = loader.LoadedRobot.of(body)
+        model = flat_scene(robot).compile()
+        errors.append(check_robot.mirror_error(model, robot, body, "left_right")["joints [rad]"])
+        masses.append(model.body_mass.sum())
+    assert errors[0] > 1e-4 and errors[1] < 1e-6
+    np.testing.assert_allclose(masses, 12.006)
+
+
+def test_a_trunk_without_joint_becomes_free(write):
+    """Its keyframe has angles alone."""
+    keys = f'<keyframe><key qpos="{"0 0.8 -1.6 " * 4}"/></keyframe>'
+    body = loader.load(write(quadruped(base="", keys=keys)))
+    free = loader.load(write(quadruped()))
+    assert body["digest"] == free["digest"] and any("free joint" in note for note in body["notes"])
+
+
+def test_missing_meshes_give_way(write):
+    """Where a body has other shapes they are left out, else a shape with its inertia takes their place."""
+    mesh = '<geom type="mesh" mesh="part"/>'
+    text = quadruped().replace('<body name="FL_thigh"', f'{mesh}<body name="FL_thigh"', 1)
+    text = text.replace('<geom name="trunk"', f'{mesh}<geom name="trunk"', 1)
+    text = text.replace("<worldbody>", '<asset><mesh name="part" file="part.stl"/></asset><worldbody>')
+    body = loader.load(write(text))
+    notes = [note for note in body["notes"] if "missing" in note]
+    assert notes == [
+        "missing meshes are left out beside other shapes: trunk",
+        "missing meshes became shapes with the inertia of the body: FL_hip",
+    ]
+    model = mujoco.MjModel.from_xml_string(body["mjcf"])
+    (shape,) = [
+        g for g in range(model.ngeom) if model.geom_bodyid[g] == model.body("FL_hip").id and model.geom_contype[g]
+    ]
+    np.testing.assert_allclose(model.geom_size[shape] ** 2 * 2 / 3 * 0.5, 1e-3, rtol=1e-5)  # inertia of a cube
+
+
+def test_a_mesh_that_is_there_becomes_a_fitted_shape(write, tmp_path):
+    corners = np.array(np.meshgrid([-0.1, 0.1], [-0.02, 0.02], [-0.02, 0.02])).reshape(3, -1).T
+    (tmp_path / "bar.obj").write_text("".join("v {} {} {}\n".format(*c) for c in corners) + CUBE)
+    text = quadruped().replace('<geom name="trunk" type="box" size="0.2 0.08 0.05"/>', '<geom type="mesh" mesh="bar"/>')
+    body = loader.load(write(text.replace("<worldbody>", '<asset><mesh file="bar.obj"/></asset><worldbody>')))
+    model = mujoco.MjModel.from_xml_string(body["mjcf"])
+    (shape,) = [g for g in range(model.ngeom) if model.geom_bodyid[g] == 1 and model.geom_contype[g]]
+    assert model.geom_type[shape] == mujoco.mjtGeom.mjGEOM_CAPSULE
+    np.testing.assert_allclose(model.geom_size[shape, :2], [0.02, 0.08], rtol=1e-4)
+    assert any("collision meshes of trunk" in note for note in body["notes"])
+
+
+CUBE = "f 1 2 4\nf 1 4 3\nf 5 8 6\nf 5 7 8\nf 1 5 6\nf 1 6 2\nf 3 4 8\nf 3 8 7\nf 1 3 7\nf 1 7 5\nf 2 6 8\nf 2 8 4\n"
+
+
+def test_the_digest_is_that_of_the_kinematics(write):
+    """It ignores masses, and changes with a length, the pose or the order of joints."""
+    first = loader.load(write(quadruped()))["digest"]
+    heavier = quadruped().replace('mass="6"', 'mass="7"')
+    assert loader.load(write(heavier))["digest"] == first
+    longer = quadruped().replace('pos="0 0 -0.2">', 'pos="0 0 -0.21">', 1)
+    swapped = quadruped(legs="".join(leg(n, *SIDES[n]) for n in reversed(SIDES)))
+    bent = loader.load(write(quadruped(), "pose = { thigh = 0.9 }"))["digest"]
+    assert len({first, bent, *(loader.load(write(text))["digest"] for text in (longer, swapped))}) == 4
+
+
+def test_loading_takes_no_time(write):
+    path = write(quadruped())
+    start = time.perf_counter()
+    loader.load(path)
+    assert time.perf_counter() - start < 2.0
+
+
+# --- what is refused ---
+
+MESH = '<asset><mesh name="m" file="m.stl"/></asset><worldbody>'
+TWO = "".join(f'<key name="{n}" qpos="0 0 0.3 1 0 0 0 {"0 0.8 -1.6 " * 4}"/>' for n in ("crouch", "sleep"))
+REFUSED = {
+    "not XML": ("no robot", "not XML"),
+    "another XML": ("<html/>", "not XML"),
+    "a fixed base": (quadruped(base='<joint axis="0 0 1" range="-1 1"/>', keys=""), "fixed base", "<freejoint/>"),
+    "a closed loop": (
+        quadruped(more=motors() + '<equality><connect body1="FL_calf" body2="FR_calf" anchor="0 0 0"/></equality>'),
+        "closed loops",
+    ),
+    "a tendon": (
+        quadruped(
+            more='<tendon><fixed name="t"><joint joint="FL_calf" coef="1"/></fixed></tendon>'
+            '<actuator><motor name="puller" tendon="t"/></actuator>'
+        ),
+        "puller",
+        "<motor joint",
+    ),
+    "a body that weighs its mesh": (
+        quadruped(keys="")
+        .replace("<worldbody>", MESH)
+        .replace('<inertial pos="0 0 0" mass="6" diaginertia="0.02 0.06 0.07"/>', '<geom type="mesh" mesh="m"/>'),
+        "mesh m is missing",
+        "trunk",
+    ),
+    "no mass": (quadruped().replace('mass="0.8"', 'mass="0"'), "mass and inertia", "<inertial>"),
+    "two keyframes": (quadruped(keys=f"<keyframe>{TWO}</keyframe>"), "crouch, sleep", "keyframe ="),
+    "no keyframe": (quadruped(keys=""), "[pose]", "FL_hip"),
+    "a joint without limits": (
+        quadruped().replace('axis="1 0 0" range="-0.8 0.8"', 'axis="1 0 0"', 1),
+        "FL_hip",
+        "range=",
+    ),
+    "a slide": (quadruped().replace('axis="1 0 0"', 'type="slide" axis="1 0 0"', 1), "only hinges", "FL_hip"),
+    "an idle joint": (quadruped(more=motors(("FL", "FR", "RL"))), "RR_hip", "no actuator"),
+    "no torque limit": (quadruped(more=motors().replace('ctrlrange="-20 20"', "")), "torque_limit ="),
+    "a pose beyond the limits": (quadruped(), "limits of FL_calf"),
+}
+TOMLS = {"a pose beyond the limits": "pose = { FL_calf = 1.0 }"}
+
+
+@pytest.mark.parametrize("fault", REFUSED)
+def test_refusals_take_one_line(write, fault):
+    text, *words = REFUSED[fault]
+    with pytest.raises(ValueError) as error:
+        loader.load(write(text, TOMLS.get(fault, "")))
+    assert "\n" not in str(error.value)
+    for word in words:
+        assert word in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("toml", "word"),
+    [
+        ("speed = 1", "unknown field 'speed'"),
+        ("pose = 1", "pose cannot be 1"),
+        ("= 3", "cannot read"),
+        ('feet = ["x"]', "'x'"),
+    ],
+)
+def test_a_wrong_robot_toml_is_refused(write, toml, word):
+    with pytest.raises(ValueError, match=word) as error:
+        loader.load(write(quadruped(), toml))
+    assert "\n" not in str(error.value)
+
+
+# --- in the environments ---
+
+
+@pytest.fixture(scope="module")
+def bodies(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("robots")
+    for name, text in (("dog", quadruped()), ("walker", biped())):
+        (folder / f"{name}.xml").write_text(text)
+    return {name: loader.load(folder / f"{name}.xml") for name in ("dog", "walker")}
+
+
+@pytest.mark.parametrize("name", ["dog", "walker"])
+def test_legs_reach_where_mujoco_says(bodies, name):
+    """Feet of the environment's own kinematics against MuJoCo's, at random joint angles."""
+    env = envs.make("loco", "c", robot=bodies[name])
+    data, rng = mujoco.MjData(env.model), np.random.default_rng(0)
+    for _ in range(4):
+        data.qpos[:] = [0, 0, 0, 1, 0, 0, 0, *rng.normal(size=env.action_dim)]
+        mujoco.mj_kinematics(env.model, data)
+        want = [data.site(foot).xpos for foot in env.robot.feet]
+        np.testing.assert_allclose(env.feet_in_base(jnp.array(data.qpos[7:])), want, atol=1e-5)
+
+
+def test_offset_joints_and_uneven_legs(write):
+    """A hinge away from its body's origin, with an angle of its own at rest, and a leg with one joint more."""
+    text = quadruped().replace(
+        'name="FL_thigh" axis="0 1 0"', 'name="FL_thigh" axis="0 1 0" pos="0.01 0 0.02" ref="0.1"'
+    )
+    text = text.replace(
+        '<joint name="FR_thigh"', '<joint name="FR_thigh_2" axis="0 0 1" range="-1 1"/><joint name="FR_thigh"'
+    )
+    text = text.replace("</actuator>", '<motor joint="FR_thigh_2" ctrlrange="-20 20"/></actuator>')
+    body = loader.load(
+        write(text.split("<keyframe>")[0] + "</mujoco>", "pose = { hip = 0.0, thigh = 0.8, calf = -1.6 }")
+    )
+    test_legs_reach_where_mujoco_says({"dog": body}, "dog")
+
+
+def test_a_dog_walks_through_its_task(bodies):
+    """Stands with zero actions, and mirrored observations follow the tables: twice is once, and feet swap sides."""
+    env = envs.make("loco", "c", robot=bodies["dog"], noise=0.0, spawn_yaw=0.0)
+    state = jax.jit(env.reset)(jax.random.key(0))
+    step = jax.jit(env.step)
+    for _ in range(50):
+        state = step(state, jnp.zeros(env.action_dim))
+        assert not state.terminated
+    assert env.motion(state.physics).foot_contact.all()
+    image = env.mirror("left_right", "obs", state.obs)
+    np.testing.assert_array_equal(env.mirror("left_right", "obs", image), state.obs)
+
+
+def test_weights_follow_the_body(bodies):
+    """Go1's numbers for a body with its motors and joints; torques of stronger motors weigh less."""
+    body = bodies["dog"]
+    twice = body | {"effort": 4 * body["effort"]}
+    weights = [envs.newcomers.loco(one).weights for one in (body, twice)]
+    assert weights[0]["torque"] == pytest.approx(4 * weights[1]["torque"])
+    assert weights[0]["pose"] == envs.locomotion.GO1_LOCO.weights["pose"]
+    assert envs.newcomers.loco(bodies["walker"]).gait_hz > 0 == envs.newcomers.loco(body).gait_hz
+
+
+def test_a_run_is_repeatable_without_its_file(write, tmp_path, refused):
+    """args.json holds the body; a checkpoint of another one is refused, in one line."""
+    path = write(quadruped())
+    args = {"task": "loco", "preset": "smoke", "total_steps": 32, "run_dir": str(tmp_path / "run")}
+    ppo_finetune.main(ppo_finetune.Args(robot=str(path), **args))
+    path.unlink()
+    record = tmp_path / "run/args.json"
+    assert loader.load(record) == json.loads(record.read_text())["config"]["body"]
+    _, meta = records.load(tmp_path / "run/policy.msgpack", "policy")
+    assert meta["body"] == loader.load(record)
+    longer = write(quadruped().replace('pos="0 0 -0.2">', 'pos="0 0 -0.21">'), name="long.xml")
+    again = ppo_finetune.Args(
+        robot=str(longer), policy=str(tmp_path / "run/policy.msgpack"), **args | {"run_dir": str(tmp_path / "b")}
+    )
+    refused(ppo_finetune.main, again, "another body", meta["body"]["digest"])
+
+
+def test_wrong_pairs_of_flags(refused, write):
+    refused(ppo_finetune.main, ppo_finetune.Args(task="loco"), "--robot FILE")
+    refused(ppo_finetune.main, ppo_finetune.Args(task="go1_loco", robot="x.xml"), "--task go1_loco", "--robot")
+    refused(ppo_finetune.main, ppo_finetune.Args(task="loco", robot="nowhere.xml"), "no such file")
