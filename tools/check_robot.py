@@ -116,17 +116,13 @@ def shake(body, engine):
     env = envs.make_explore(body, engine, **({"rough": 0.0} if engine == "mjx" else {}))
     start = time.perf_counter()
 
-    @jax.jit
-    def run(state):
-        def step(state, key):
-            state = jax.vmap(env.step)(state, jax.random.normal(key, (ROBOTS, env.action_dim)))
-            return state, (state.metrics, state.terminated)
+    def step(state, key):
+        state = jax.vmap(env.step)(state, jax.random.normal(key, (ROBOTS, env.action_dim)))
+        return state, (state.metrics, state.terminated)
 
-        return jax.lax.scan(step, state, jax.random.split(jax.random.key(1), STEPS))[1]
-
-    report, ended = jax.block_until_ready(
-        run(jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), ROBOTS)))
-    )
+    state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), ROBOTS))
+    run = jax.jit(lambda state, keys: jax.lax.scan(step, state, keys)[1])
+    report, ended = jax.block_until_ready(run(state, jax.random.split(jax.random.key(1), STEPS)))
     return {
         "diverged": int(report["diverged"].sum()),
         "lost contacts": int(report["overflow"].sum()) if "overflow" in report else 0,
