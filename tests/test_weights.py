@@ -36,11 +36,11 @@ SOURCES = {
         "alive": (None, 0.25),
     },
     "g1_loco": {  # Isaac Lab, G1 flat
-        "track_lin_vel": (1.0, 1.5),
-        "track_yaw_rate": (1.0, 1.5),
+        "track_lin_vel": (1.0, 3.0),
+        "track_yaw_rate": (1.0, 3.0),
         "single_stance": (0.75, None),
-        "in_step": (None, 2.0),
-        "foot_path": (None, 1.5),
+        "in_step": (None, 1.5),
+        "foot_path": (None, 1.0),
         "slip": (-0.1, -0.2),
         "impact": (None, -0.2),
         "joint_limits": -1.0,  # there of the ankles alone
