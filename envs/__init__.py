@@ -58,10 +58,10 @@ def make(task, engine="auto", /, robust=False, robot=None, **overrides):
     if task in GENERIC and robot:
         family, build = GENERIC[task]
         config = build(body_of(robot))
-    elif task in GENERIC or robot:
-        raise ValueError(
-            f"--task {task} and --robot FILE go together" if robot else f"--task {task} needs --robot FILE"
-        )
+    elif task in GENERIC:
+        raise ValueError(f"--task {task} needs --robot FILE")
+    elif robot:
+        raise ValueError(f"robot cannot be set: {FIXED['robot']}; --robot FILE goes with --task {', '.join(GENERIC)}")
     elif task not in TASKS:
         raise ValueError(f"unknown task {task!r}; choose one of {', '.join(TASKS | GENERIC)}")
     else:

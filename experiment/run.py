@@ -60,6 +60,7 @@ class Run:
     def __init__(self, args, config, total, shown, over="env_steps"):
         """args and config are recorded in args.json; total: iterations of the run; for the rest see Progress."""
         self.args, self.config, self.total, self.shown, self.over = args, config, total, shown, over
+        self.body = getattr(config, "body", {})  # of a robot from a file
         self.each = each_seed(args)
         self.folders = [Path(one.run_dir) if devices.is_first() else None for one in self.each]
         self.rows = [[] for _ in self.each]
@@ -71,8 +72,8 @@ class Run:
         They come last: `init` may raise a UserError, which must leave an older run as it is.
         """
         print("  ".join(f"{name}={value}" for name, value in dataclasses.asdict(self.args).items()), flush=True)
-        if self.config.body:
-            print("\n".join(loader.lines(self.config.body)), flush=True)
+        if self.body:
+            print("\n".join(loader.lines(self.body)), flush=True)
         if self.args.resume:
             records.claim(self.args.resume)
             state, self.rows[0] = records.load_state(self.args.resume, jax.eval_shape(lambda: init(self.args)))
@@ -151,7 +152,7 @@ class Run:
                     f"python tools/replay.py {args.run_dir}"
                 )
             if folder:
-                meta = {"task": args.task, "args": dataclasses.asdict(args), "body": self.config.body}
+                meta = {"task": args.task, "args": dataclasses.asdict(args), "body": self.body}
                 records.save(folder / "policy.msgpack", params, meta)
         if self.due:
             self.save(unstack(states))

@@ -87,7 +87,8 @@ CLOCK = ("stance", "swing_height")  # of the gait's clock, read only if there is
 
 def task_of(config):
     """A run's config as args.json has it, in a form in which runs of the same task are equal, whatever their age."""
-    task = {name: value for name, value in (LATER | config).items() if name != "robust"}  # what --robust would set
+    known = (LATER | config).items()
+    task = {name: value for name, value in known if name not in ("robust", "body")}  # what --robust, --robot would set
     if isinstance(seconds := task.get("command_seconds"), float):
         task["command_seconds"] = [seconds, seconds]
     return {name: value for name, value in task.items() if task["gait_hz"] or name not in CLOCK}

@@ -72,6 +72,11 @@ class Simulation:
         self.contact = np.linalg.norm(self.forces, axis=1) > 1
         self.heights = np.array([self.read(f"{foot}_pos")[2] for foot in self.feet]) - env.robot.sole
         self.weight = 9.81 * mujoco.mj_getTotalmass(env.model)  # [N] without what is added
+        at_rest = mujoco.MjData(model)
+        at_rest.qpos[:] = 0, 0, 0, 1, 0, 0, 0, *self.home
+        mujoco.mj_kinematics(model, at_rest)
+        standing = env.robot.sole - min(at_rest.site(foot).xpos[2] for foot in self.feet)
+        self.rise = data.qpos[2] / standing - 1  # of the base above where it is in the default pose
 
     def pull(self):
         """kp (target - q) of each joint, before the limit."""
@@ -153,6 +158,7 @@ def locomotion(now, memory, task, clock):
         "stand_on_feet": (1 - moving) * sum(not on for on in now.contact),
         "joint_limits": sum(near_limit(now, joint, q) for joint, q in zip(now.joints, now.q, strict=True)),
         "slip": sum(slips),
+        "height": now.rise**2,
         "pose": np.sum(off**2),
         "alive": 1.0,
     }

@@ -285,7 +285,9 @@ def test_arguments_beside_resume_are_refused_even_at_their_default(usual, monkey
 @pytest.fixture
 def untrained(usual, monkeypatch):
     """play.Args of a policy whose evaluation and pictures cost nothing."""
-    monkeypatch.setattr(play, "evaluate", lambda env, *_: ({}, 0.0, np.zeros((4, env.engine.model.nq))))
+    monkeypatch.setattr(
+        play, "evaluate", lambda env, *_: ({}, env.reset(jax.random.key(0)), np.zeros((4, env.engine.model.nq)))
+    )
     monkeypatch.setattr(render, "video", lambda *_: b"film")
     converter, helper = types.ModuleType("jax2onnx"), types.SimpleNamespace(set_model_props=lambda *_: None)
     converter.to_onnx = lambda *_, **__: types.SimpleNamespace(SerializeToString=lambda: b"graph")
