@@ -367,5 +367,5 @@ def test_a_run_is_repeatable_without_its_file(write, tmp_path, refused):
 
 def test_wrong_pairs_of_flags(refused, write):
     refused(ppo_finetune.main, ppo_finetune.Args(task="loco"), "--robot FILE")
-    refused(ppo_finetune.main, ppo_finetune.Args(task="go1_loco", robot="x.xml"), "--task go1_loco", "--robot")
+    refused(ppo_finetune.main, ppo_finetune.Args(task="go1_loco", robot="x.xml"), "belongs to the task", "--task loco")
     refused(ppo_finetune.main, ppo_finetune.Args(task="loco", robot="nowhere.xml"), "no such file")
