@@ -94,24 +94,22 @@ class Motion:
 
 @flax.struct.dataclass
 class FootClocks:
-    """Time of each foot in the air and on the ground, for tasks that reward a gait."""
+    """Time of each foot in the air, for tasks that reward a gait."""
 
     air_time: jax.Array  # (F,) [s] since the foot left the ground
-    contact_time: jax.Array  # (F,) [s] since it landed
     landed_after: jax.Array  # (F,) [s] flight that ended in this step, else 0
 
     @classmethod
     def started(cls, feet, **task):
         """Clocks of `feet` feet at the start of an episode; further fields for a task that adds some."""
         zero = jnp.zeros(feet)
-        return cls(zero, zero, zero, **task)
+        return cls(zero, zero, **task)
 
     def tick(self, contact, dt):
         """Advance by one control step; contact (F,) bool."""
         return self.replace(
             landed_after=jnp.where(contact, self.air_time, 0.0),
             air_time=jnp.where(contact, 0.0, self.air_time + dt),
-            contact_time=jnp.where(contact, self.contact_time + dt, 0.0),
         )
 
 
