@@ -82,19 +82,22 @@ def load(args, kind="EVALUATION_FIELDS", **fields):
 
 
 def evaluate(env, net, params, episodes, level=None):
-    """One episode per environment with the mean action, fixed seed. Metrics, first state, its qpos (steps, nq)."""
+    """One episode per environment with the mean action, fixed seed. Metrics; of the first: its start, qpos (steps, nq).
+
+    The pose of the step that ends the first episode is repeated to the last step.
+    """
 
     def step(carry, _):
-        env_state, alive = carry
+        env_state, alive, qpos = carry
         action = net.apply(params, net.inputs(env_state.obs, env_state.history), method=net.mean)
         env_state = jax.vmap(env.step)(env_state, action)
         ended = alive & (env_state.terminated | env_state.truncated)
-        out = env_state.metrics, alive, ended, alive & env_state.terminated, env_state.physics.qpos[0]
-        return (env_state, alive & ~ended), out
+        qpos = jnp.where((alive & ~ended)[0], env_state.physics.qpos[0], qpos)
+        return (env_state, alive & ~ended, qpos), (env_state.metrics, alive, ended, alive & env_state.terminated, qpos)
 
     curriculum = None if level is None else env.at_level(level)
     env_state = jax.vmap(partial(env.reset, curriculum=curriculum))(jax.random.split(jax.random.key(1), episodes))
-    carry = env_state, jnp.ones(episodes, bool)
+    carry = env_state, jnp.ones(episodes, bool), env_state.physics.qpos[0]
     _, (report, alive, ended, fell, qpos) = jax.lax.scan(step, carry, None, env.episode_steps)
     result = metrics.of_first_episodes(report, alive, ended) | {"falls": fell.any(0).mean()}
     return result, jax.tree.map(lambda x: x[0], env_state), qpos
