@@ -8,7 +8,12 @@ import mujoco
 import numpy as np
 
 GEOM = mujoco.mjtGeom
-REFLECTIONS = {"left_right": np.diag([1.0, -1, 1]), "front_back": np.diag([-1.0, 1, 1])}
+
+# A reflection negates one component of a polar vector (velocity, gravity, foot position) and the other two
+# of an axial one (angular velocity, joint axis).
+POLAR = {"left_right": np.array([1, -1, 1]), "front_back": np.array([-1, 1, 1])}
+AXIAL = {name: -signs for name, signs in POLAR.items()}
+REFLECTIONS = {name: np.diag(signs) for name, signs in POLAR.items()}
 NEAR = {"position": 0.005, "centre": 0.015, "mass": 0.05}  # how far mirror images may differ: [m], [m], share
 
 
@@ -35,7 +40,38 @@ def posed(spec, pose):
     return model, data
 
 
+def bottom(model, data, geom):
+    """Lowest height of a geom in the world [m], infinite for shapes without one."""
+    z, (a, b, c), up = data.geom_xpos[geom, 2], model.geom_size[geom], data.geom_xmat[geom, 6:]
+    match model.geom_type[geom]:
+        case GEOM.mjGEOM_SPHERE:
+            return z - a
+        case GEOM.mjGEOM_CAPSULE:
+            return z - a - abs(up[2]) * b
+        case GEOM.mjGEOM_CYLINDER:
+            return z - a * np.hypot(up[0], up[1]) - abs(up[2]) * b
+        case GEOM.mjGEOM_BOX:
+            return z - np.abs(up) @ (a, b, c)
+        case GEOM.mjGEOM_ELLIPSOID:
+            return z - np.linalg.norm(up * (a, b, c))
+    return np.inf
+
+
 # --- feet and contacts ---
+
+
+def feet_at_sites(spec, body):
+    """Feet of a file that has sites for them, named `..._foot`, and their height above its lowest shape."""
+    model, data = posed(spec, np.zeros(len(body["joints"])))  # with all joints at 0 flat feet are level
+    feet = [site for site in map(model.site, range(model.nsite)) if site.name.endswith("_foot")]
+    places = data.site_xpos[[foot.id for foot in feet]]
+    ground = min(bottom(model, data, geom) for geom in np.flatnonzero(model.geom_contype))
+    return {
+        "feet": [foot.name for foot in feet],
+        "foot_bodies": [model.body(foot.bodyid[0]).name for foot in feet],
+        "sole": abs(round(places[:, 2].min() - ground, 6)),
+        "gait": gait(places[:, :2]),
+    }
 
 
 def feet_of(path, spec, body, shapes, wishes):
@@ -119,13 +155,13 @@ def alone(points, patch):
 
 
 def gait(places):
-    """Share of a step by which each foot is ahead: neighbours on a side, and images, are half a step apart."""
+    """Share of a step by which feet are ahead of the first: neighbours on a side, and images, are half a step apart."""
     shares = np.zeros(len(places))
     for side in (1, -1):
         row = sorted((i for i, (_, y) in enumerate(places) if (y > 0) == (side > 0)), key=lambda i: -places[i][0])
         for number, i in enumerate(row):
             shares[i] = (number + (side < 0)) % 2 / 2
-    return shares
+    return (shares - shares[0]) % 1
 
 
 # --- symmetry ---

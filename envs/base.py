@@ -11,9 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from envs import terrain
+from envs.anatomy import AXIAL, POLAR
 from envs.engine import RANDOMISED, Physics, make_engine
-from envs.loader import LoadedRobot
-from envs.robots import AXIAL, POLAR, ROBOTS
+from envs.loader import Robot
+from envs.robots import ROBOTS
 from envs.rotations import axis_angle, inverse, multiply, rotate, yaw_of
 
 # Half-width of uniform sensor noise, as in Isaac Lab's tasks. Commands and the last action are exact.
@@ -144,7 +145,7 @@ class Env:
 
     def __init__(self, config, engine="auto"):
         self.config = config
-        self.robot = LoadedRobot.of(config.body) if config.body else ROBOTS[config.robot]
+        self.robot = Robot.of(config.body) if config.body else ROBOTS[config.robot]
         self.dt = config.physics_dt * config.decimation  # [s] control step
         for name, most in (("action_delay", (config.history - 1) * self.dt), ("sensor_lag", self.dt)):
             if not 0 <= getattr(config, name)[0] <= getattr(config, name)[1] <= most:

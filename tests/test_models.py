@@ -1,4 +1,4 @@
-"""The MJCF against figures of the robots' published descriptions, and the robot tables against the MJCF."""
+"""The MJCF against figures of the robots' published descriptions; what is derived of it against what policies know."""
 
 import mujoco
 import numpy as np
@@ -52,6 +52,56 @@ JOINTS = {
 }
 
 
+QUADRUPED = {"axes": "xyy" * 4, "gait": (0.0, 0.5, 0.5, 0.0)}
+G1_LEG, G1_WAIST = "hip_pitch hip_roll hip_yaw knee ankle_pitch ankle_roll", "waist_yaw waist_roll waist_pitch"
+G1_ARM = "shoulder_pitch shoulder_roll shoulder_yaw elbow wrist_roll wrist_pitch wrist_yaw"
+G1_JOINTS = [
+    f"{side}_{joint}_joint" for part in (G1_LEG, G1_ARM) for side in ("left", "right") for joint in part.split()
+]
+
+# what recorded policies and data rely on: order of joints, their axes at rest, action zero, unit of action, feet, and
+# the sides that change places
+KNOWN = {
+    "anymal_d": QUADRUPED
+    | {
+        "joints": [f"{leg}_{joint}" for leg in ("LF", "RF", "LH", "RH") for joint in ("HAA", "HFE", "KFE")],
+        "default_pose": (0.0, 0.4, -0.8) * 2 + (0.0, -0.4, 0.8) * 2,
+        "action_scale": (0.5,) * 12,
+        "feet": ("LF_foot", "RF_foot", "LH_foot", "RH_foot"),
+        "sole": 0.031455,
+        "mirrors": {"left_right": ("LF RF", "LH RH"), "front_back": ("LF LH", "RF RH")},
+    },
+    "go1": QUADRUPED
+    | {
+        "joints": [f"{leg}_{joint}_joint" for leg in ("FR", "FL", "RR", "RL") for joint in ("hip", "thigh", "calf")],
+        "default_pose": (0.0, 0.9, -1.8) * 4,
+        "action_scale": (0.25,) * 12,
+        "feet": ("FR_foot", "FL_foot", "RR_foot", "RL_foot"),
+        "sole": 0.023,
+        "mirrors": {"left_right": ("FR FL", "RR RL")},
+    },
+    "g1": {
+        "joints": [*G1_JOINTS[:12], *(f"{joint}_joint" for joint in G1_WAIST.split()), *G1_JOINTS[12:]],
+        "axes": "yxzyyx" * 2 + "zxy" + "yxzyxyz" * 2,
+        "default_pose": (
+            *(-0.312, 0.0, 0.0, 0.669, -0.363, 0.0) * 2,
+            *(0.0, 0.0, 0.073),
+            *(0.2, 0.2, 0.0, 0.6, 0.0, 0.0, 0.0),
+            *(0.2, -0.2, 0.0, 0.6, 0.0, 0.0, 0.0),
+        ),
+        "action_scale": (
+            *(0.293, 0.463, 0.293, 0.463, 0.5, 0.5) * 2,
+            *(0.293, 0.167, 0.167),
+            *(0.083, 0.083, 0.083, 0.083, 0.5, 0.5, 0.5) * 2,
+        ),
+        "feet": ("left_foot", "right_foot"),
+        "gait": (0.0, 0.5),
+        "sole": 0.0,
+        "mirrors": {"left_right": ("left right",)},
+    },
+}
+
+
 @pytest.fixture(params=ROBOTS)
 def robot(request):
     return ROBOTS[request.param]
@@ -89,12 +139,29 @@ def test_joints_and_gains(robot, model):
         np.testing.assert_allclose(actuator.forcerange, [-effort, effort])
 
 
-def test_table_follows_the_mjcf(robot, model):
-    """Joint order, axes and feet that the Python side assumes are those of the compiled model."""
-    assert tuple(model.actuator(i).name for i in range(model.nu)) == robot.joints
-    assert tuple(model.joint(i + 1).name for i in range(model.nu)) == robot.joints
-    np.testing.assert_array_equal(model.jnt_axis[1:], [np.eye(3)["xyz".index(axis)] for axis in robot.axes])
-    assert all(model.site(foot).id >= 0 for foot in robot.feet)
+def test_robots_are_as_policies_know_them(robot, model):
+    """To the bit: a policy that was trained before acts as it did."""
+    known = KNOWN[robot.name]
+    for name in ("joints", "default_pose", "action_scale", "feet", "gait", "sole"):
+        want = known[name]
+        assert getattr(robot, name) == (want if name == "sole" else tuple(want)), name
+    assert [model.actuator(i).name for i in range(model.nu)] == known["joints"]
+    assert [model.joint(i + 1).name for i in range(model.nu)] == known["joints"]
+    np.testing.assert_array_equal(model.jnt_axis[1:], [np.eye(3)["xyz".index(axis)] for axis in known["axes"]])
+
+
+def test_mirrors_are_as_policies_know_them(robot):
+    """Joints and feet change places by name. A mirror keeps an angle about its normal and turns the others round."""
+    known = KNOWN[robot.name]
+    assert list(robot.mirrors) == list(known["mirrors"])
+    for mirror, sides in known["mirrors"].items():
+        swap = {a: b for pair in map(str.split, sides) for a, b in (pair, pair[::-1])}
+        image = lambda name: "_".join(swap.get(word, word) for word in name.split("_"))  # noqa: E731
+        perm, sign = robot.mirror_joints(mirror)
+        assert [robot.joints[i] for i in perm] == [image(joint) for joint in robot.joints]
+        assert [robot.feet[i] for i in robot.mirror_feet(mirror)] == [image(foot) for foot in robot.feet]
+        normal = {"left_right": "y", "front_back": "x"}[mirror]
+        assert sign.tolist() == [1 if axis == normal else -1 for axis in known["axes"]]
 
 
 def test_default_pose_is_within_limits(robot, model):

@@ -14,10 +14,11 @@ import pytest
 import envs
 import play
 from envs.base import NOISE
-from envs.robots import GO1
+from envs.robots import ROBOTS
 from tools import play_onnx, sim_to_sim
 
 ROOT = Path(__file__).resolve().parent.parent
+GO1 = ROBOTS["go1"]
 FACTS = {
     "robot": "go1",
     "dt": 0.02,
@@ -62,7 +63,7 @@ def ours():
 
 def others_go1():
     """Text of a Go1 as others may write it: other names, legs in another order, D gains as damping, a scene, meshes."""
-    spec = mujoco.MjSpec.from_file(str(GO1.xml))
+    spec = GO1.spec()
     for geom in [geom for geom in spec.geoms if geom.group == 2]:
         spec.delete(geom)
     text = re.sub(r'damping="[\d.]+"', 'damping="2"', spec.to_xml())
@@ -150,6 +151,19 @@ def test_a_urdf_without_meshes_and_free_joint_stands(tmp_path, ours):
     assert record.alive.all()
 
 
+def test_a_payload_that_is_fixed_adds_its_mass_once(tmp_path, ours):
+    """In URDF and MJCF: the model is compiled twice."""
+    inertia = '<inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0" ixz="0" iyz="0"/>'
+    box = f'<link name="box"><inertial><mass value="0.5"/>{inertia}</inertial></link>'
+    box += '<joint name="box" type="fixed"><parent link="trunk"/><child link="box"/></joint></robot>'
+    (tmp_path / "dog.urdf").write_text(urdf(ours).replace("</robot>", box))
+    box = '<body><inertial mass="0.5" pos="0 0 0" diaginertia="1 1 1"/></body><camera name="track"'
+    (tmp_path / "dog.xml").write_text(GO1.mjcf.replace('<camera name="track"', box))
+    for name in ("dog.urdf", "dog.xml"):
+        mass = sim_to_sim.load_robot(tmp_path / name, FACTS).model.body_mass.sum()
+        assert mass == pytest.approx(ours.model.body_mass.sum() + 0.5, abs=1e-9), name
+
+
 def test_armature_is_lent_to_joints_that_have_none(tmp_path, ours):
     (tmp_path / "dog.urdf").write_text(urdf(ours))
     robot = sim_to_sim.load_robot(tmp_path / "dog.urdf", FACTS)
@@ -169,7 +183,7 @@ def test_bodies_have_their_limits(ours):
 
 
 def test_extra_joints_are_held_and_named(tmp_path):
-    text = GO1.xml.read_text().replace(
+    text = GO1.mjcf.replace(
         '<camera name="track"',
         '<body name="arm"><joint name="gripper"/><inertial mass="0.1" pos="0 0 0" diaginertia="1 1 1"/></body>'
         '<camera name="track"',
@@ -181,7 +195,7 @@ def test_extra_joints_are_held_and_named(tmp_path):
 
 def test_a_joint_that_turns_the_other_way_is_named(tmp_path, ours):
     joint = '<joint name="FL_calf_joint" class="calf"'
-    text = GO1.xml.read_text()
+    text = GO1.mjcf
     assert joint in text
     (tmp_path / "x.xml").write_text(text.replace(joint, f'{joint} axis="0 -1 0"'))
     assert sim_to_sim.unlike(sim_to_sim.load_robot(tmp_path / "x.xml", FACTS), ours) == ["FL_calf_joint"]
@@ -212,7 +226,7 @@ def test_lowest_points_of_tilted_shapes(shape):
 
 def test_feet_may_touch_the_floor_by_contact_pairs_only(tmp_path, ours):
     """As in files for MJX; a pair with a geom that is left out is left out too."""
-    text = re.sub(r'name="(\w+_foot_c)"', r'name="\1" contype="0" conaffinity="0"', GO1.xml.read_text())
+    text = re.sub(r'name="(\w+_foot_c)"', r'name="\1" contype="0" conaffinity="0"', GO1.mjcf)
     pairs = [f'<pair geom1="{foot}_c" geom2="floor"/>' for foot in GO1.feet] + ['<pair geom1="cone" geom2="floor"/>']
     scene = '<geom name="floor" type="plane" size="1 1 1"/><geom name="cone" size="0.1"/>'
     text = text.replace("<sensor>", f"<contact>{''.join(pairs)}</contact><sensor>").replace(
@@ -228,7 +242,7 @@ def test_feet_may_touch_the_floor_by_contact_pairs_only(tmp_path, ours):
 def test_a_foot_is_where_its_ball_is(tmp_path):
     """Not between the ball and a shin that ends just above it."""
     shin = '<geom class="collision" type="capsule" size="0.01" fromto="0.1 0 -0.1 0 0 -0.23"/>'
-    text = re.sub(r'(<geom [^>]*name="\w+_foot_c"[^>]*/>)', rf"\1{shin}", GO1.xml.read_text())
+    text = re.sub(r'(<geom [^>]*name="\w+_foot_c"[^>]*/>)', rf"\1{shin}", GO1.mjcf)
     (tmp_path / "shin.xml").write_text(text)
     robot = sim_to_sim.load_robot(tmp_path / "shin.xml", FACTS)
     _, data = robot.placed(robot.pose)
@@ -254,7 +268,7 @@ def test_weight_on_the_knees_is_told_from_weight_on_the_feet(ours):
 
 def test_a_model_of_which_only_the_feet_touch_the_ground_is_named(tmp_path, ours):
     """As Playground's: the same kneeling robot sinks in, and the tool says why."""
-    text = re.sub(r'name="(\w+_c)"', r'name="\1" contype="0"', GO1.xml.read_text())
+    text = re.sub(r'name="(\w+_c)"', r'name="\1" contype="0"', GO1.mjcf)
     text = re.sub(r'name="(\w+_foot_c)" contype="0"', r'name="\1"', text)
     (tmp_path / "feet.xml").write_text(text)
     robot = sim_to_sim.load_robot(tmp_path / "feet.xml", FACTS)
@@ -285,7 +299,7 @@ def test_motors_are_explicit_pd_with_a_limit_on_the_whole_torque(ours):
 
 def test_readings_are_those_of_mujoco_sensors(tmp_path):
     """Velocities and gravity in the base frame, and noise as wide as in training."""
-    text = GO1.xml.read_text().replace(
+    text = GO1.mjcf.replace(
         "<sensor>",
         '<sensor><velocimeter name="v" site="base"/><gyro name="w" site="base"/>'
         '<framezaxis name="up" objtype="body" objname="world" reftype="site" refname="base"/>',
@@ -378,8 +392,8 @@ def test_bad_models_are_one_line(tmp_path):
             sim_to_sim.load_robot(tmp_path / "bad.xml", FACTS)
         assert "\n" not in str(found.value)
 
-    good = GO1.xml.read_text()
-    with pytest.raises(sim_to_sim.records.UserError, match="no model"):
+    good = GO1.mjcf
+    with pytest.raises(sim_to_sim.records.UserError, match="no such file"):
         sim_to_sim.load_robot(tmp_path / "missing.xml", FACTS)
     refuse("not <xml", "not an XML file")
     refuse("<html/>", "MuJoCo cannot read")
@@ -391,7 +405,7 @@ def test_bad_models_are_one_line(tmp_path):
     refuse(re.sub(r"<sensor>.*</sensor>", "", nothing, flags=re.S), "no shapes but meshes")
     mesh = '<body name="cap"><geom type="mesh" mesh="m"/></body><camera name="track"'
     heavy = good.replace("<asset>", '<asset><mesh name="m" file="m.stl"/>').replace('<camera name="track"', mesh)
-    refuse(heavy, "cap has the mass of a mesh")
+    refuse(heavy, "cap has its mass from mesh m")
 
 
 @pytest.mark.parametrize("task", ["anymal_pedipulation", "anymal_parkour_walk"])
@@ -424,7 +438,7 @@ def test_arguments_that_make_no_sense(refused):
         args = sim_to_sim.Args("x.onnx", "x.xml", **change)
         with pytest.raises(sim_to_sim.records.UserError, match=words):
             sim_to_sim.check_args(args, FACTS)
-    refused(sim_to_sim.main, sim_to_sim.Args("missing.onnx", str(GO1.xml)), "there is no policy missing.onnx")
+    refused(sim_to_sim.main, sim_to_sim.Args("missing.onnx", GO1.xml), "there is no policy missing.onnx")
 
 
 # --- A real policy ---
@@ -469,10 +483,10 @@ def test_both_models_are_compared(exported, tmp_path, capsys):
 def test_without_onnxruntime_it_is_one_line(refused, monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
     (tmp_path / "x.onnx").write_bytes(b"")
-    refused(sim_to_sim.main, sim_to_sim.Args(str(tmp_path / "x.onnx"), str(GO1.xml)), "requirements-export.txt")
+    refused(sim_to_sim.main, sim_to_sim.Args(str(tmp_path / "x.onnx"), GO1.xml), "requirements-export.txt")
 
 
 def test_a_file_that_is_no_policy_is_one_line(refused, tmp_path):
     pytest.importorskip("onnxruntime")
     (tmp_path / "x.onnx").write_bytes(b"not a graph")
-    refused(sim_to_sim.main, sim_to_sim.Args(str(tmp_path / "x.onnx"), str(GO1.xml)), "is not a policy")
+    refused(sim_to_sim.main, sim_to_sim.Args(str(tmp_path / "x.onnx"), GO1.xml), "is not a policy")

@@ -17,7 +17,8 @@ BUDGET = {  # lines, with blanks and docstrings
 STAGES = ("ppo_explore", "pretrain_pidm", "ppo_finetune")
 MODULES = {  # package -> its modules; each may import what stands before it
     "envs": (
-        *("gl", "rotations", "config", "robots", "anatomy", "loader", "terrain", "engine", "rewards", "base"),
+        *("gl", "rotations", "config", "anatomy", "reader", "builder", "loader", "robots", "terrain", "engine"),
+        *("rewards", "base"),
         "courses",
         *("locomotion", "explore", "newcomers", "pedipulation", "parkour", "render"),
     ),

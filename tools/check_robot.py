@@ -187,7 +187,7 @@ def check(args):
     except ValueError as error:
         raise records.UserError(str(error)) from None
     print("\n".join(loader.lines(body)), flush=True)
-    robot = loader.LoadedRobot.of(body)
+    robot = loader.Robot.of(body)
     model = terrain.flat_scene(robot).compile()
     stood = stand(model, robot, body)
     print("default pose held:", records.line(stood))

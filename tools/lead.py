@@ -54,7 +54,7 @@ def scene(robot, poses, size, scale):
     spec = terrain.flat_scene(robot, visual=True)
     spec.camera("track").name = "robot"  # render.draw looks through the one called track
     for i in range(1, len(poses)):
-        spec.attach(mujoco.MjSpec.from_file(str(robot.xml)), prefix=f"{i}/", frame=spec.worldbody.add_frame())
+        spec.attach(robot.spec(), prefix=f"{i}/", frame=spec.worldbody.add_frame())
     along = np.append(poses[-1, :2] - poses[0, :2], 0.0)
     along /= np.linalg.norm(along)
     back = np.array([np.cos(ELEVATION) * along[1], -np.cos(ELEVATION) * along[0], np.sin(ELEVATION)])

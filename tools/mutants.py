@@ -143,8 +143,8 @@ FAULTS = {  # (file, tests, words for -k) -> faults: name, old text, new text
     ("envs/rotations.py", "test_rewards", "rollout and g1_loco"): [
         ("yaw of a level robot alone", "2 * (w * z + x * y)", "2 * (w * z - x * y)"),
     ],
-    ("envs/robots.py", "test_models", "mirrored_dynamics and go1"): [
-        ("a mirror of the wrong sign", 'AXIAL = {"left_right": np.array([-1,', 'AXIAL = {"left_right": np.array([1,'),
+    ("envs/anatomy.py", "test_models", "mirrored_dynamics and go1"): [
+        ("a mirror that keeps all signs", "signs.append(int(np.sign(along)))", "signs.append(1)"),
     ],
     ("envs/locomotion.py", "test_envs", "changes_when_due"): [
         ("a command for ever", "select(task.remaining <= 0,", "select(False,"),
@@ -214,8 +214,8 @@ FAULTS = {  # (file, tests, words for -k) -> faults: name, old text, new text
     ("envs/engine.py", "test_envs", "reach_the_engine and mjx"): [
         ("joints without friction held", "xp.maximum(joint_friction[..., None], 1e-6)", "joint_friction[..., None]"),
     ],
-    ("envs/robots.py", "test_envs", "joint_by_joint"): [
-        ("one scale for all joints", "action_scale=G1_SCALE", "action_scale=(0.5,) * 29"),
+    ("envs/loader.py", "test_envs", "joint_by_joint"): [
+        ("one scale for all joints", "np.round(np.minimum(0.25 * limits / kp, 0.5), 3)", "np.full(len(names), 0.5)"),
     ],
     ("envs/__init__.py", "test_scripts", "cannot_be_set"): [
         ("any text turns --robust on", "if not isinstance(robust, bool):", "if False:"),

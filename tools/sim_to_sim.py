@@ -14,7 +14,6 @@ import json
 import os
 import re
 import sys
-import xml.etree.ElementTree as ET
 from collections import defaultdict
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,6 +26,8 @@ import numpy as np
 import tyro
 from mujoco.batch import Batch
 
+from envs import reader
+from envs.anatomy import bottom
 from envs.base import NOISE
 from envs.engine import cpu_count
 from envs.robots import ROBOTS
@@ -35,12 +36,11 @@ from experiment import gait, records
 FACTS = ("robot", "dt", "joints", "default_pose", "action_scale", "kp", "kd", "torque_limit", "history", "prop")
 READINGS = ("lin_vel", "ang_vel", "gravity", "command", "joint_pos", "joint_vel", "phase")
 HISTORY = ("prop_history", "action_history")
-DROPPED = ("actuators", "sensors", "keys", "tendons", "equalities", "skins", "lights", "cameras", "tuples")
-DROPPED += ("materials", "textures", "meshes", "hfields")  # lists of an MjSpec
 UPRIGHT = np.cos(np.deg2rad(60.0))  # of the base's tilt; less is a fall
 LOW = 0.5  # of the standing height; a lower base is a fall
 DIVERGED = 1e3  # [m, m/s, rad/s] out of reach of any sound simulation
 GEOM, SENSOR = mujoco.mjtGeom, mujoco.mjtSensor
+JOINT, FREE = mujoco.mjtObj.mjOBJ_JOINT, mujoco.mjtJoint.mjJNT_FREE
 
 
 @dataclass(frozen=True)
@@ -79,89 +79,37 @@ def match(wanted, found):
 # --- Reading a model ---
 
 
-def read_spec(path):
-    """MjSpec of an MJCF or URDF file; UserError if it is neither."""
-    try:
-        root = ET.parse(path).getroot()
-    except ET.ParseError as error:
-        raise records.UserError(f"{path} is not an XML file: {error}") from None
-    try:
-        if root.tag != "robot":
-            return mujoco.MjSpec.from_file(str(path))
-        spec = mujoco.MjSpec.from_string(urdf_text(root))
-    except (ValueError, mujoco.FatalError) as error:
-        raise records.UserError(f"MuJoCo cannot read {path}: {first_line(error)}") from None
-    for geom in spec.geoms:
-        geom.mass = 0.0  # in URDF a link without <inertial> has no mass, whatever its shapes
-    return spec
+def read_joints(path, spec, wanted):
+    """The file's names (A,) of the joints that are `wanted`, and the names of its other joints."""
+    found = [joint.name for joint in spec.joints if joint.type != FREE]
+    names = match(wanted, found)
+    if missing := [name for name, got in zip(wanted, names, strict=True) if got is None]:
+        raise ValueError(f"{path} has no joint for {', '.join(missing)}; it has {', '.join(found) or 'none'}")
+    return names, [name for name in found if name not in names]
 
 
-def urdf_text(root):
-    """URDF without looks and meshes, whose root link stays a body of its own."""
-    for link in root.iter("link"):
-        for part in [*link.findall("visual"), *link.findall("collision")]:
-            if part.tag == "visual" or part.find("geometry/mesh") is not None:
-                link.remove(part)
-    for tag in ("material", "mujoco"):
-        for part in root.findall(tag):
-            root.remove(part)
-    ET.SubElement(ET.SubElement(root, "mujoco"), "compiler", fusestatic="false", discardvisual="false")
-    return ET.tostring(root, encoding="unicode")
+def isolate(path, spec, names):
+    """Leave only the robot, free and without meshes; joints without a name in `names` become stiff at 0.
 
-
-def first_line(error):
-    """An error of MuJoCo in one line."""
-    return " ".join(str(error).split())[:200]
-
-
-def weighs(spec, geom):
-    """True if a geom adds to the mass of the robot."""
-    computed = spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
-    if geom.parent == spec.worldbody or (geom.parent.explicitinertial and not computed):
-        return False
-    return geom.density > 0 if np.isnan(geom.mass) else geom.mass > 0
-
-
-def strip(spec, path):
-    """Leave only the robot: no meshes or looks, no scene, no actuators, sensors and the like."""
-    for geom in spec.geoms:
-        geom.material = ""
-        meshy = geom.meshname or geom.type in (GEOM.mjGEOM_MESH, GEOM.mjGEOM_SDF)
-        if meshy and weighs(spec, geom):
-            name = geom.parent.name
-            raise records.UserError(f"{path}: {name} has the mass of a mesh, which is left out; give it an <inertial>")
-        if meshy or geom.parent == spec.worldbody:
-            spec.delete(geom)
-    for site in spec.sites:
-        site.material = ""
-    for part in (part for kind in DROPPED for part in list(getattr(spec, kind))):
-        spec.delete(part)
-
-
-def free_base(spec, path, names):
-    """The robot's root body, which is the only one left under the world and has a free joint.
-
-    `names` are the joints to keep; all others become stiff at 0.
+    Returns its base's name.
     """
+    reader.drop(spec, "actuators", "keys", "equalities")
     roots = list(spec.worldbody.bodies)
-    count = [sum(joint.name in names for joint in all_joints(root)) for root in roots]
+    count = [sum(joint.name in names for joint in root.find_all(JOINT)) for root in roots]
     base = roots[int(np.argmax(count))]
     if max(count) < len(names):
-        raise records.UserError(f"the joints in {path} hang on several bodies; it must be one robot")
+        raise ValueError(f"the joints in {path} hang on several bodies; it must be one robot")
     for root in roots:
         if root != base:
             spec.delete(root)
-    for joint in all_joints(base):
-        if joint.name not in names and joint.type != mujoco.mjtJoint.mjJNT_FREE:
+    for joint in base.find_all(JOINT):
+        if joint.name not in names and joint.type != FREE:
             spec.delete(joint)
-    if not any(joint.type == mujoco.mjtJoint.mjJNT_FREE for joint in base.joints):
-        base.add_freejoint()
+    base = reader.base_of(path, spec, [])
+    reader.strip(path, spec, {reader.mesh_name(mesh) for mesh in spec.meshes})
+    for i, geom in enumerate(spec.geoms):
+        geom.name = geom.name or f"geom {i}"
     return base
-
-
-def all_joints(body):
-    """Joints of a body and of all below it."""
-    return [*body.joints, *(joint for child in body.bodies for joint in all_joints(child))]
 
 
 def add_ground(spec):
@@ -208,23 +156,6 @@ class Foot:
     sole: float  # [m] height above the ground
 
 
-def bottom(model, data, geom):
-    """Lowest height of a geom in the world [m], infinite for shapes without one."""
-    z, (a, b, c), up = data.geom_xpos[geom, 2], model.geom_size[geom], data.geom_xmat[geom, 6:]
-    match model.geom_type[geom]:
-        case GEOM.mjGEOM_SPHERE:
-            return z - a
-        case GEOM.mjGEOM_CAPSULE:
-            return z - a - abs(up[2]) * b
-        case GEOM.mjGEOM_CYLINDER:
-            return z - a * np.hypot(up[0], up[1]) - abs(up[2]) * b
-        case GEOM.mjGEOM_BOX:
-            return z - np.abs(up) @ (a, b, c)
-        case GEOM.mjGEOM_ELLIPSOID:
-            return z - np.linalg.norm(up * (a, b, c))
-    return np.inf
-
-
 def solid_geoms(model):
     """Geoms (G,) of the robot that the floor stops."""
     floor = model.geom("floor").id
@@ -252,7 +183,7 @@ def joint_above(model, body, known):
 
 def last_joints(robot):
     """Index (F,) into the policy's joints of the last joint of each leg of one of our robots."""
-    model = mujoco.MjModel.from_xml_path(str(robot.xml))
+    model = robot.spec().compile()
     joints = [model.joint(name).id for name in robot.joints]
     return [joint_above(model, model.site(foot).bodyid[0], joints) for foot in robot.feet]
 
@@ -260,7 +191,7 @@ def last_joints(robot):
 def find_feet(model, joints, pose, ends, path):
     """The feet: the F lowest ends in the default pose, in the order of `ends`, their last joints.
 
-    UserError if these are not the feet of our robot.
+    ValueError if these are not the feet of our robot.
     """
     data = mujoco.MjData(model)
     data.qpos[model.jnt_qposadr[joints]] = pose
@@ -273,7 +204,7 @@ def find_feet(model, joints, pose, ends, path):
     feet = {}
     for body in lowest:
         if low[body] == np.inf:
-            raise records.UserError(f"{path}: the feet have no shapes but meshes, which are left out; add some spheres")
+            raise ValueError(f"{path}: the feet have no shapes but meshes, which are left out; add some spheres")
         sole = min(shapes[body], key=lambda g: bottom(model, data, g))
         like = [g for g in shapes[body] if model.geom_type[g] == model.geom_type[sole]]
         touching = [g for g in like if bottom(model, data, g) < low[body] + 0.005]
@@ -283,7 +214,7 @@ def find_feet(model, joints, pose, ends, path):
         feet[end] = Foot(model.body(body).name, place, [model.geom(g).name for g in like], middle[2] - low[body])
     if feet.keys() != set(range(len(ends))):
         names = ", ".join(model.body(body).name for body in lowest)
-        raise records.UserError(f"{path}: its lowest bodies, {names}, are not the feet of the policy's robot")
+        raise ValueError(f"{path}: its lowest bodies, {names}, are not the feet of the policy's robot")
     return [feet[i] for i in range(len(ends))]
 
 
@@ -367,35 +298,26 @@ class Robot:
 
 def load_robot(path, facts, timestep=0.002):
     """Robot of an MJCF or URDF file with the motors of the policy's facts. UserError if it is not that robot."""
-    path, ours = Path(path), ROBOTS[facts["robot"]]
-    if not path.is_file():
-        raise records.UserError(f"there is no model {path}")
-    spec = read_spec(path)
-    found = [joint.name for joint in spec.joints if joint.type != mujoco.mjtJoint.mjJNT_FREE]
-    names = match(facts["joints"], found)
-    missing = [name for name, got in zip(facts["joints"], names, strict=True) if got is None]
-    if missing:
-        raise records.UserError(f"{path} has no joint for {', '.join(missing)}; it has {', '.join(found) or 'none'}")
-    for i, body in enumerate(spec.bodies):
-        body.name = body.name or f"body {i}"
-    for i, geom in enumerate(spec.geoms):
-        geom.name = geom.name or f"geom {i}"
     try:
-        strip(spec, path)
-        base = free_base(spec, path, names)
-        add_ground(spec)
-        add_motors(spec, names, facts)
-        set_options(spec, timestep)
-        model = spec.compile()
-        joints, pose = [model.joint(name).id for name in names], np.array(facts["default_pose"])
-        feet = find_feet(model, joints, pose, last_joints(ours), path)
-        add_sensors(spec, feet, base.name)
-        spec.compiler.fusestatic = True  # not before: each compilation would add what is fused once more
-        model = spec.compile()
+        return build_robot(Path(path), facts, timestep)
     except (ValueError, mujoco.FatalError) as error:
-        raise records.UserError(f"MuJoCo cannot compile {path}: {first_line(error)}") from None
+        raise records.UserError(reader.one_line(error)) from None
+
+
+def build_robot(path, facts, timestep):
+    """As `load_robot`, but with a ValueError."""
+    ours, pose = ROBOTS[facts["robot"]], np.array(facts["default_pose"])
+    spec = reader.read(path)
+    names, fixed = read_joints(path, spec, facts["joints"])
+    base = isolate(path, spec, names)
+    add_ground(spec)
+    add_motors(spec, names, facts)
+    set_options(spec, timestep)
+    model = reader.compiled(path, spec)
+    feet = find_feet(model, [model.joint(name).id for name in names], pose, last_joints(ours), path)
+    add_sensors(spec, feet, base)
+    model = reader.compiled(path, spec)
     joints = [model.joint(name).id for name in names]
-    fixed = [name for name in found if name not in names]
     adr = model.jnt_qposadr[joints], model.jnt_dofadr[joints]
     return Robot(str(path), model, names, fixed, pose, *adr, ours.feet, np.mean([foot.sole for foot in feet]))
 
