@@ -2,6 +2,7 @@
 
 import functools
 import os
+import re
 import sys
 from pathlib import Path
 
@@ -18,6 +19,14 @@ import pytest
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 import envs
+from experiment.run import Run
+
+LONG = ("test_scripts", "test_sim_to_sim", "test_watch", "test_world")  # late in the alphabet
+
+
+def pytest_collection_modifyitems(items):
+    """Long files begin, for a process that is left with one at the end keeps the others waiting."""
+    items.sort(key=lambda item: item.path.stem not in LONG)
 
 
 class Jitted:
@@ -43,6 +52,24 @@ class Jitted:
 def jitted():
     """jitted(task, **overrides) -> Jitted, cached."""
     return functools.cache(Jitted)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def compiled_once():
+    """Trainings whose program and environment are the same to the letter share one compilation."""
+    programs = {}
+
+    def compile(self, function, *inputs):
+        lowered = function.lower(*inputs)
+        text = re.sub(r"{index = \d+ : ui64}", "", lowered.as_text())  # the callback of engine c, which is the config's
+        key = type(self.args), getattr(self.args, "task", None), repr(self.config), text
+        if key not in programs:
+            programs[key] = lowered.compile()
+        return programs[key]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Run, "compile", compile)
+        yield
 
 
 @pytest.fixture

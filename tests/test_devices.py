@@ -11,8 +11,11 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+import tyro
 
+import ppo_explore
 import ppo_finetune as script
+import pretrain_pidm
 from experiment import records
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -33,6 +36,12 @@ def finish(*processes):
     for process, (_, err) in zip(processes, outputs, strict=True):
         assert process.returncode == 0, err
     return [out for out, _ in outputs]
+
+
+def here(module, words):
+    """The same in this process, which has one device."""
+    assert jax.device_count() == 1
+    module.main(tyro.cli(module.Args, args=[str(word) for word in words[1:]]))
 
 
 def hosts(words):
@@ -85,14 +94,15 @@ def runs(tmp_path_factory):
     """A collection of one process and one of two, on engine mjx; and what the two processes printed."""
     out = tmp_path_factory.mktemp("devices")
     collect = ["ppo_explore.py", "--robot", "go1", *SMOKE, "--set", "rough=0", "--total-steps", "128", "--run-dir"]
-    finish(start([*collect, out / "one"]))
+    here(ppo_explore, [*collect, out / "one"])
     return out, finish(*hosts([*collect, out / "hosts"]))
 
 
 def test_training_on_two_devices_is_training_on_one(tmp_path):
     """Sums over environments are made in another order: single precision and Adam's first steps allow 1e-4."""
     train = ["ppo_finetune.py", "--task", "go1_loco", *SMOKE, "--run-dir"]
-    finish(start([*train, tmp_path / "one"]), start([*train, tmp_path / "two"], TWO))
+    here(script, [*train, tmp_path / "one"])
+    finish(start([*train, tmp_path / "two"], TWO))
     policies = [weights(tmp_path / name / "policy.msgpack", "policy") for name in ("one", "two")]
     np.testing.assert_allclose(*policies, atol=1e-4)
     rows = [list(csv.DictReader((tmp_path / name / "metrics.csv").open())) for name in ("one", "two")]
@@ -120,6 +130,7 @@ def test_only_the_first_host_prints_and_writes(runs):
 
 def test_stage_two_on_two_devices_is_stage_two_on_one(runs, tmp_path):
     pretrain = ["pretrain_pidm.py", "--data", runs[0] / "one", "--preset", "smoke", "--run-dir"]
-    finish(start([*pretrain, tmp_path / "a"]), start([*pretrain, tmp_path / "b"], TWO))
+    here(pretrain_pidm, [*pretrain, tmp_path / "a"])
+    finish(start([*pretrain, tmp_path / "b"], TWO))
     checkpoints = [weights(tmp_path / name / "pidm.msgpack", "PIDM checkpoint") for name in "ab"]
     np.testing.assert_allclose(*checkpoints, atol=1e-4)

@@ -127,7 +127,7 @@ def test_same_key_same_rollout(jitted, task):
 @pytest.mark.parametrize("task", [*LOCOMOTION, "anymal_pedipulation"])
 def test_robots_start_on_their_feet(jitted, task):
     """At reset the lowest foot site is `sole` above the ground, by MuJoCo's kinematics; nobody starts inside it."""
-    env, state = jitted(task).env, jitted(task).start(16)
+    env, state = jitted(task).env, jitted(task).start(4)
     data = mujoco.MjData(env.model)
     for qpos in np.asarray(state.physics.qpos):
         data.qpos[:] = qpos
@@ -161,7 +161,7 @@ def test_motion_is_what_mujoco_says(jitted, task):
 def test_history_is_padded_then_shifts(jitted):
     """The first x fills the history and actions are zero; then both move on by one, oldest first."""
     task = jitted("go1_loco")
-    state = task.start(3)
+    state = task.start(4)
     first = np.asarray(state.history["prop"])
     assert np.ptp(first, axis=1).max() == 0 and not np.any(state.history["action"])
     actions, props = [], [first[:, -1]]
@@ -177,7 +177,7 @@ def test_history_is_padded_then_shifts(jitted):
 
 def test_history_is_what_the_policy_saw(jitted):
     """x_t in the history carries the same noise as the observation of the same step."""
-    env, state = jitted("go1_loco").env, jitted("go1_loco").start(3)
+    env, state = jitted("go1_loco").env, jitted("go1_loco").start(4)
     state = jitted("go1_loco").act(state, 0)
     obs, prop = np.asarray(state.obs), np.asarray(state.history["prop"][:, -1])
     scales = {name: scale for name, (_, scale) in env.OBS.items()}
@@ -192,7 +192,7 @@ def test_history_is_what_the_policy_saw(jitted):
 
 def test_noise_has_the_stated_width(jitted):
     env = jitted("go1_loco").env
-    state = jitted("go1_loco").start(256)
+    state = jitted("go1_loco").start(512)
     exact = np.asarray(jax.vmap(env.motion)(state.physics).joint_vel)
     seen = np.asarray(state.history["prop"][:, -1, 18:30]) - exact
     assert 1.4 < np.abs(seen).max() <= 1.5
@@ -208,16 +208,16 @@ def overturned(state):
 def test_failure_resets_everything(jitted):
     """A fallen robot terminates; a new episode follows, and final_obs shows the old one."""
     task = jitted("go1_loco")
-    state = task.start(2)
+    state = task.start(4)
     for i in range(3):
         state = task.act(state, i)
     after = task.hold(overturned(state))
-    assert after.terminated.tolist() == [True, False] and after.truncated.tolist() == [False, False]
-    assert after.clock.tolist() == [0, 4] and after.episode_return[0] == 0 and after.episode_return[1] != 0
+    assert after.terminated.tolist() == [True, False, False, False] and not np.any(after.truncated)
+    assert after.clock.tolist() == [0, 4, 4, 4] and after.episode_return[0] == 0 and after.episode_return[1] != 0
     assert not np.any(after.action[0]) and not np.any(after.history["action"][0])
     assert np.ptp(after.history["prop"][0], axis=0).max() == 0
     assert not np.any(after.physics.qvel[0]) and not np.any(after.task.air_time[0])
-    assert after.physics.qpos[0, 2] == pytest.approx(float(jitted("go1_loco").start(1).physics.qpos[0, 2]), abs=1e-6)
+    assert after.physics.qpos[0, 2] == pytest.approx(float(task.start(4).physics.qpos[0, 2]), abs=1e-6)
     assert after.final_obs[0, 8] > 0.5 > after.obs[0, 8], "gravity in final_obs is of the overturned robot"
     np.testing.assert_array_equal(after.final_obs[1], after.obs[1])
     np.testing.assert_array_equal(after.final_history["prop"][1], after.history["prop"][1])
@@ -226,12 +226,10 @@ def test_failure_resets_everything(jitted):
 
 def test_time_limit_truncates(jitted):
     task = jitted("go1_loco")
-    keys = jax.random.split(jax.random.key(0), 2)
-    last = task.env.episode_steps - 1
-    state = jax.jit(jax.vmap(task.env.reset))(keys, jnp.array([last, 0]))
-    after = task.hold(state)
-    assert after.truncated.tolist() == [True, False] and not np.any(after.terminated)
-    assert after.clock.tolist() == [0, 1]
+    state = task.start(4)
+    after = task.hold(state.replace(clock=state.clock.at[0].set(task.env.episode_steps - 1)))
+    assert after.truncated.tolist() == [True, False, False, False] and not np.any(after.terminated)
+    assert after.clock.tolist() == [0, 1, 1, 1]
     assert after.metrics["episode_seconds"][0] == pytest.approx(20.0)
     assert not np.array_equal(after.final_obs[0], after.obs[0])
 
@@ -239,13 +237,13 @@ def test_time_limit_truncates(jitted):
 def test_divergence_is_caught_and_counted(jitted):
     """A simulation that blows up ends, is counted, and leaves only finite numbers behind."""
     task = jitted("go1_loco")
-    state = task.start(3)
+    state = task.start(4)
     state = state.replace(
         physics=state.physics.replace(qvel=state.physics.qvel.at[0, 8].set(jnp.nan).at[1, 7].set(1e9))
     )
     after = task.hold(state)
-    assert after.terminated.tolist() == [True, True, False]
-    assert after.metrics["diverged"].tolist() == [True, True, False]
+    assert after.terminated.tolist() == [True, True, False, False]
+    assert after.metrics["diverged"].tolist() == [True, True, False, False]
     for leaf in jax.tree.leaves(without_keys(after)):
         assert np.all(np.isfinite(np.asarray(leaf, np.float64)))
 
@@ -270,12 +268,12 @@ def with_task(state, **fields):
 def test_command_changes_when_due(jitted):
     """After the time that was drawn with it, whatever the clock says, and then for as long again."""
     task = jitted("go1_loco")
-    state = with_task(task.start(2), remaining=jnp.array([2, 100]))
-    before = task.hold(state.replace(clock=jnp.array([498, 499], jnp.int32)))
+    state = with_task(task.start(4), remaining=jnp.array([2, 100, 2, 100]))
+    before = task.hold(state.replace(clock=jnp.array([498, 499, 0, 0], jnp.int32)))
     after = task.hold(before)
     changed = np.any(np.asarray(after.task.command[:, :2] != before.task.command[:, :2]), axis=1)
-    assert before.task.remaining.tolist() == [1, 99] and after.task.remaining.tolist() == [500, 98]
-    assert changed.tolist() == [True, False]
+    assert before.task.remaining.tolist() == [1, 99] * 2 and after.task.remaining.tolist() == [500, 98] * 2
+    assert changed.tolist() == [True, False] * 2
 
 
 def test_shares_and_ranges_of_commands():
@@ -294,17 +292,17 @@ def test_shares_and_ranges_of_commands():
 def test_a_turning_rate_is_not_steered(jitted):
     """It stays as drawn while the robot turns; a command to stand is zero whatever its kind."""
     task = jitted("go1_loco")
-    command = jnp.tile(jnp.array([0.0, 0.0, 0.7]), (2, 1))
-    state = with_task(task.start(2), command=command, moves=jnp.array([True, False]), steers=jnp.zeros(2, bool))
+    command, moves = jnp.tile(jnp.array([0.0, 0.0, 0.7]), (4, 1)), jnp.array([True, False] * 2)
+    state = with_task(task.start(4), command=command, moves=moves, steers=jnp.zeros(4, bool))
     state = task.hold(state.replace(physics=state.physics.replace(qvel=state.physics.qvel.at[:, 5].set(2.0))))
-    np.testing.assert_array_equal(state.task.command, [[0, 0, np.float32(0.7)], [0, 0, 0]])
+    np.testing.assert_array_equal(state.task.command, [[0, 0, np.float32(0.7)], [0, 0, 0]] * 2)
 
 
 def test_a_command_that_was_set_holds(jitted):
     """No other one follows, and no heading steers it, even if one was due in this step or told to stand."""
     task = jitted("go1_loco")
-    state = with_task(task.start(3), remaining=jnp.array([1, 2, 400]), moves=jnp.array([True, False, True]))
-    command = jnp.array([[0.8, -0.2, 0.5], [0.3, 0.0, -1.0], [0.0, 0.0, 0.0]])
+    state = with_task(task.start(4), remaining=jnp.array([1, 2, 400, 1]), moves=jnp.array([True, False, True, False]))
+    command = jnp.array([[0.8, -0.2, 0.5], [0.3, 0.0, -1.0], [0.0, 0.0, 0.0], [0.0, 0.5, 0.0]])
     state = state.replace(task=jax.vmap(task.env.set_command)(state.task, command))
     for i in range(4):
         state = task.act(state, i)
@@ -313,10 +311,10 @@ def test_a_command_that_was_set_holds(jitted):
 
 
 @pytest.mark.parametrize(("seconds", "share"), [(0.0, 1.0), (0.01, 1.0), (0.1, 0.2), (0.2, 0.1)])
-def test_tracked_velocity_is_low_passed(seconds, share):
+def test_tracked_velocity_is_low_passed(seconds, share, jitted):
     """At a constant velocity the rest of the first one decays by a share of dt / seconds in each step, at most 1."""
-    env = envs.make("go1_loco", "c", tracking_seconds=seconds, spawn_velocity=0.5)
-    state = jax.jit(env.reset)(jax.random.key(0))
+    env = envs.make("go1_loco", "c", tracking_seconds=seconds)
+    state = jax.tree.map(lambda x: x[0], jitted("go1_loco", spawn_velocity=0.5).start(4))  # a reset knows no seconds
     first, last = np.asarray(state.task.velocity), np.array([0.7, -0.3, 0.9])
     np.testing.assert_allclose(first[2], state.physics.qvel[5], atol=1e-6)
     motion = env.motion(state.physics)
@@ -371,17 +369,17 @@ def test_feet_of_the_gait_are_half_a_step_apart(paced, task, pairs):
 def test_phase_is_the_clock_of_the_next_reward(paced):
     """Sine and cosine of the time since the episode began, as the policy and a robot without JAX see it; 0 at rest."""
     biped = paced("g1_loco")
-    state = biped.start(3)
-    command = jnp.array([[0.5, 0.0, 0.0], [0.0, 0.0, -0.4], [0.0, 0.0, 0.0]])
-    state = state.replace(clock=jnp.array([0, 7, 9], jnp.int32))
+    state = biped.start(4)
+    command = jnp.array([[0.5, 0.0, 0.0], [0.0, 0.0, -0.4], [0.0, 0.0, 0.0], [0.3, 0.0, 0.0]])
+    state = state.replace(clock=jnp.array([0, 7, 9, 3], jnp.int32))
     state = state.replace(task=jax.vmap(biped.env.set_command)(state.task, command))
-    moves = np.array([1, 1, 0])
+    moves = np.array([1, 1, 0, 1])
     for _ in range(3):
         state = biped.hold(state)
         angle = np.pi / HALF * np.asarray(state.clock)
         want = np.stack([np.sin(angle), np.cos(angle)], 1) * moves[:, None]
         np.testing.assert_allclose(state.obs[:, biped.env.obs_slices()["phase"]], want, atol=1e-5)
-        for n in range(3):
+        for n in range(4):
             q, v, seconds = np.eye(1, 36, 3)[0], np.zeros(35), int(state.clock[n]) * 0.02
             facts, data = {"gait_hz": biped.env.config.gait_hz}, SimpleNamespace(qpos=q, qvel=v)
             robot = SimpleNamespace(data=data, facts=facts, seconds=seconds)
@@ -408,7 +406,7 @@ def alike(state, **fields):
     return state.replace(physics=state.physics.replace(**fit), **zero | fields)
 
 
-def test_randomised_delays_and_motors_are_drawn_in_their_ranges(varied):
+def test_randomised_delays_and_motors_are_drawn_in_their_ranges(varied, jitted):
     """One delay, lag and joint friction a robot, one strength a motor, and new ones in a new episode."""
     state = varied.start(256)
     for values, low, high in (
@@ -424,10 +422,10 @@ def test_randomised_delays_and_motors_are_drawn_in_their_ranges(varied):
     after = varied.hold(overturned(state))
     for name in ("delay", "lag"):
         assert (np.asarray(getattr(after, name)) != np.asarray(getattr(state, name))).tolist() == [True] + [False] * 255
-    plain = envs.make("go1_loco", "c")
-    start = jax.jit(plain.reset)(jax.random.key(0))
-    assert float(start.delay) == float(start.lag) == 0 and np.all(np.asarray(start.physics.strength) == 1)
-    assert not np.any(plain.model.dof_frictionloss), "no friction, no rows for the solver"
+    plain = jitted("go1_loco")
+    start = plain.start(4)
+    assert not np.any(start.delay) and not np.any(start.lag) and np.all(np.asarray(start.physics.strength) == 1)
+    assert not np.any(plain.env.model.dof_frictionloss), "no friction, no rows for the solver"
 
 
 def test_late_actions(varied):
@@ -458,8 +456,9 @@ def test_late_actions(varied):
 
 def test_late_readings(varied):
     """At a lag of 20 ms x_t is that of the step before, at 10 ms the mean of the two; rewards see the truth."""
-    state, lag = alike(varied.start(3), lag=jnp.array([0.0, 0.5, 1.0])), np.array([[0.0], [0.5], [1.0]])
-    state = state.replace(task=jax.vmap(varied.env.set_command)(state.task, jnp.zeros((3, 3))))
+    lag = np.array([[0.0], [0.5], [1.0]] * 2)
+    state = alike(varied.start(6), lag=jnp.asarray(lag[:, 0]))
+    state = state.replace(task=jax.vmap(varied.env.set_command)(state.task, jnp.zeros((6, 3))))
 
     def truth(physics):
         qpos, qvel = np.asarray(physics.qpos), np.asarray(physics.qvel)
@@ -469,14 +468,14 @@ def test_late_readings(varied):
             down.append(turn.reshape(3, 3).T @ [0, 0, -1])
         return np.hstack([qvel[:, 3:6], down, qpos[:, 7:] - varied.env.robot.default_pose, qvel[:, 6:]])
 
-    state = state.replace(readings=jax.tree.map(lambda x: jnp.stack([x[0]] * 3), state.readings))
+    state = state.replace(readings=jax.tree.map(lambda x: jnp.stack([x[0]] * 6), state.readings))
     before = truth(state.physics)
     for i in range(4):
-        state = varied.step(state, jnp.tile(0.5 * jax.random.normal(jax.random.key(i), (12,)), (3, 1)))
+        state = varied.step(state, jnp.tile(0.5 * jax.random.normal(jax.random.key(i), (12,)), (6, 1)))
         now = truth(state.physics)
         np.testing.assert_allclose(state.history["prop"][:, -1], now + lag * (before - now), atol=1e-4)
         np.testing.assert_allclose(state.obs[:, 24:36], 0.05 * (now + lag * (before - now))[:, 18:], atol=1e-5)
-        np.testing.assert_allclose(state.reward, jnp.repeat(state.reward[:1], 3), atol=1e-5)
+        np.testing.assert_allclose(state.reward, jnp.repeat(state.reward[:1], 6), atol=1e-5)
         assert np.abs(now - before).max() > 1
         before = now
 
@@ -499,7 +498,7 @@ def test_weak_motors_pull_less_up_to_the_same_limit():
 def test_joint_friction_is_that_of_mujoco(varied):
     """As a model with this frictionloss in every joint moves in plain MuJoCo; pulls below it hardly move a joint."""
     env = varied.env
-    state = alike(varied.start(2))
+    state = jax.tree.map(lambda x: x[:2], alike(varied.start(6)))
     physics = state.physics.replace(joint_friction=jnp.array([0.0, 0.4]), qpos=state.physics.qpos.at[:, 2].add(0.5))
     start, target = np.asarray(physics.qpos[0]), env.default_pose + 0.01  # 0.2 to 0.3 N m
     step, moved = jax.jit(jax.vmap(env.engine.step)), []

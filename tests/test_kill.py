@@ -1,4 +1,4 @@
-"""kill -9 at random moments: what a script left can be read, and --resume goes on from it, as often as it happens.
+"""kill -9 at a random moment: what a script left can be read, and --resume goes on from it, as often as it happens.
 
 KILLS=20 python -m pytest tests/test_kill.py
 """
@@ -15,17 +15,21 @@ from pathlib import Path
 import flax
 import numpy as np
 import pytest
+from test_resume import Interrupted
 
 import ppo_explore
-from experiment import records
+import ppo_finetune
+import pretrain_pidm
+from experiment import records, run
 
 ROOT = Path(__file__).resolve().parent.parent
-KILLS = int(os.environ.get("KILLS", "2"))
+KILLS = int(os.environ.get("KILLS", "1"))
 ENDLESS = {
     "ppo_explore.py": ("--robot", "go1", "--total-steps", "1000000", "--save-minutes", "0"),
     "pretrain_pidm.py": ("--epochs", "100000"),
     "ppo_finetune.py": ("--task", "go1_loco", "--total-steps", "100000000", "--save-minutes", "0"),
 }
+MAIN = {"ppo_explore.py": ppo_explore, "pretrain_pidm.py": pretrain_pidm, "ppo_finetune.py": ppo_finetune}
 RESULT = {"pretrain_pidm.py": ("pidm.msgpack", "PIDM checkpoint"), "ppo_finetune.py": ("policy.msgpack", "policy")}
 
 
@@ -52,7 +56,7 @@ def data(tmp_path_factory):
 
 
 @pytest.mark.parametrize("script", ENDLESS)
-def test_killed_at_any_moment(script, data, tmp_path):
+def test_killed_at_any_moment(script, data, tmp_path, monkeypatch):
     rng, out, before = random.Random(script), tmp_path / "run", 0
     extra = ("--data", data) if script == "pretrain_pidm.py" else ()
     words = [*ENDLESS[script], *extra, "--preset", "smoke", "--run-dir", out]
@@ -73,3 +77,6 @@ def test_killed_at_any_moment(script, data, tmp_path):
             name, kind = RESULT[script]
             records.load(out / name, kind)
         words = ["--resume", out]
+    monkeypatch.setattr(run, "Progress", Interrupted)
+    MAIN[script].main(MAIN[script].Args(resume=str(out)))
+    assert len(rows_of(out)) == before + 1

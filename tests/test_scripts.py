@@ -6,7 +6,6 @@ import json
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import jax
@@ -18,6 +17,7 @@ import play
 import ppo_finetune as script
 from envs import render
 from experiment import records
+from experiment.progress import Progress
 
 ROOT = Path(__file__).resolve().parent.parent
 SMOKE = script.Args(preset="smoke")
@@ -75,41 +75,41 @@ def test_seeds_whose_folder_is_taken_are_refused_together(trained, tmp_path, ref
     assert [path.name for path in tmp_path.iterdir()] == ["seed1"]
 
 
-def test_one_compile(jitted):
-    """A chunk's output feeds the next chunk without another compilation."""
+@pytest.fixture(scope="module")
+def fresh(jitted):
+    """Go1's environment, the parts of a training of 64 of them, and the state before it."""
     env = jitted("go1_loco").env
-    args = script.merge(SMOKE, env.config.ppo)
-    net = script.ActorCritic(args.hidden, env.action_dim, args.init_std)
-    opt = script.optax.scale_by_adam()
-    chunk = jax.jit(lambda s: script.iteration(args, env, net, opt, s))
-    state = script.init_state(args, env, net, opt)
-    for _ in range(3):
-        state, _ = chunk(state)
-    assert chunk._cache_size() == 1
+    args = dataclasses.replace(script.merge(SMOKE, env.config.ppo), num_envs=64)
+    net, opt = script.make_net(args, env), script.optax.scale_by_adam()
+    return env, (args, env, net, opt), script.init_state(args, env, net, opt)
 
 
-def test_first_actions_are_small(jitted):
+def test_one_compile(fresh):
+    """An iteration's output feeds the next one without another compilation: a weak type would ask for it."""
+    _, parts, state = fresh
+    before, (after, _) = jax.eval_shape(lambda state: (state, script.iteration(*parts, state)), state)
+    assert jax.tree.structure(after) == jax.tree.structure(before)
+    for (path, a), b in zip(jax.tree.leaves_with_path(before), jax.tree.leaves(after), strict=True):
+        assert (a.shape, a.dtype, a.weak_type) == (b.shape, b.dtype, b.weak_type), jax.tree_util.keystr(path)
+
+
+def test_first_actions_are_small(fresh):
     """A fresh actor commands (nearly) the default pose whatever it sees."""
-    env = jitted("go1_loco").env
-    args = script.merge(SMOKE, env.config.ppo)
-    net = script.ActorCritic(args.hidden, env.action_dim, args.init_std)
-    state = script.init_state(args, env, net, script.optax.scale_by_adam())
+    _, (_, _, net, _), state = fresh
     assert np.abs(net.apply(state.params, {"obs": state.env.obs}, method=net.mean)).max() < 0.1
 
 
-def test_first_clocks_are_spread(jitted):
-    env = jitted("go1_loco").env
-    args = dataclasses.replace(script.merge(SMOKE, env.config.ppo), num_envs=64)
-    net = script.ActorCritic(args.hidden, env.action_dim, args.init_std)
-    clocks = np.asarray(script.init_state(args, env, net, script.optax.scale_by_adam()).env.clock)
+def test_first_clocks_are_spread(fresh):
+    env, _, state = fresh
+    clocks = np.asarray(state.env.clock)
     assert clocks.min() < 200 and clocks.max() > 800 and clocks.max() < env.episode_steps
 
 
-def test_play_prints_and_draws(trained):
+def test_play_prints_and_draws(trained, capsys):
     out, _ = trained
-    process = run("play.py", out / "policy.msgpack", "--episodes", 2)
-    assert process.returncode == 0, process.stderr
-    assert "lin_vel_error" in process.stdout and "falls" in process.stdout
+    play.main(play.Args(str(out / "policy.msgpack"), episodes=2))
+    printed = capsys.readouterr().out
+    assert "lin_vel_error" in printed and "falls" in printed
     assert (out / "rollout.png").stat().st_size > 10_000 and (out / "rollout.gif").read_bytes()[:4] == b"GIF8"
     report = json.loads((out / "eval.json").read_text())
     assert 0 < report["task"]["episode_seconds"] < 20 and report["task"]["falls"] == 1.0
@@ -221,13 +221,10 @@ def test_out_of_memory_names_what_to_lower(tmp_path, refused, monkeypatch):
     refused(script.main, args, "out of memory", "--num-envs", "allocating 99 bytes")
 
 
-def test_a_run_is_not_overwritten(trained):
-    """In a process of its own: what a user sees of a refusal."""
+def test_a_run_is_not_overwritten(trained, refused):
     before = (trained[0] / "metrics.csv").read_bytes()
-    process = run("ppo_finetune.py", "--preset", "smoke", "--task", "g1_loco", "--run-dir", trained[0])
-    assert process.returncode == 2 and "Traceback" not in process.stderr
-    assert [text.startswith("error: ") for text in process.stderr.splitlines()] == [True]
-    assert "--force" in process.stderr and (trained[0] / "metrics.csv").read_bytes() == before
+    refused(script.main, dataclasses.replace(SMOKE, run_dir=str(trained[0])), "holds a run", "--force")
+    assert (trained[0] / "metrics.csv").read_bytes() == before
 
 
 def start_run(folder, **changes):
@@ -258,26 +255,19 @@ def test_unknown_preset_lists_the_right_ones():
     assert process.returncode == 2 and "smoke" in process.stderr and "Traceback" not in process.stderr
 
 
-def test_interrupt_keeps_the_files(tmp_path):
+def test_interrupt_keeps_the_files(tmp_path, monkeypatch, capsys):
     """Ctrl-C after the first row ends the run with policy, metrics and curve in place."""
-    command = [
-        sys.executable,
-        "ppo_finetune.py",
-        "--preset",
-        "smoke",
-        "--total-steps",
-        "100000000",
-        "--run-dir",
-        str(tmp_path),
-    ]
-    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
-        deadline = time.monotonic() + 120
-        while not (tmp_path / "policy.msgpack").exists() and time.monotonic() < deadline:
-            time.sleep(0.2)
-        process.send_signal(signal.SIGINT)
-        out, err = process.communicate(timeout=60)
-    assert process.returncode == 0 and "interrupted" in out and "Traceback" not in err, err
+    show = Progress.show
+
+    def interrupt(*inputs):
+        show(*inputs)
+        signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(Progress, "show", interrupt)
+    before = signal.getsignal(signal.SIGINT)
+    script.main(dataclasses.replace(SMOKE, total_steps=100_000_000, run_dir=str(tmp_path)))
+    assert "interrupted" in capsys.readouterr().out and signal.getsignal(signal.SIGINT) == before
     rows = list(csv.DictReader((tmp_path / "metrics.csv").open()))
-    assert rows and all(None not in row.values() for row in rows)
+    assert len(rows) == 1 and None not in rows[0].values()
     records.load(tmp_path / "policy.msgpack", "policy")
     assert (tmp_path / "curve.png").exists()

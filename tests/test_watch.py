@@ -70,13 +70,14 @@ def test_the_robot_goes_where_it_is_told(walker, command, slowest, fastest):
 
     Backward is a weakness of the recorded policy: from some starts it goes back, from others it stays where it is.
     """
+    motion = jax.jit(walker.env.motion)
     for _ in range(4):
         walker.restart()
         walker.set_command(0, command)
         speeds = []
         for _ in range(120):
             walker.step()
-            speeds.append(float(walker.env.motion(walker.state.physics).lin_vel[0]))
+            speeds.append(float(motion(walker.state.physics).lin_vel[0]))
         assert int(walker.state.clock) == 120, "it fell"
         assert slowest < np.mean(speeds[60:]) < fastest, np.mean(speeds[60:])
     walker.update_picture()
