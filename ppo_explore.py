@@ -114,7 +114,7 @@ def dense(width, fan_in, gain, weight_init):
     def pytorch(key, shape, dtype):
         return jax.random.uniform(key, shape, dtype, -1.0, 1.0) / fan_in**0.5
 
-    if weight_init == "pytorch":
+    if weight_init != "orthogonal":
         return nn.Dense(width, kernel_init=pytorch, bias_init=pytorch)
     return nn.Dense(width, kernel_init=nn.initializers.orthogonal(gain))
 
@@ -368,8 +368,7 @@ def gae(args, reward, done, value, last_value):
         advantage = delta + args.gamma * args.gae_lambda * (1 - done) * advantage
         return (advantage, value), advantage
 
-    init = jnp.zeros_like(last_value), last_value
-    _, advantage = jax.lax.scan(backward, init, (reward, done, value), reverse=True)
+    _, advantage = jax.lax.scan(backward, (jnp.zeros_like(last_value), last_value), (reward, done, value), reverse=True)
     return advantage, advantage + value
 
 

@@ -6,8 +6,7 @@
 Evaluate, film, steer or export the trained policy with play.py.
 Reads top to bottom: arguments, networks, warm start, rollout, losses, update, training.
 The algorithm follows rsl_rl, a fork of which the paper used. Differences are marked `# Deviation (name):`.
-Shapes in comments: T rollout steps, N environments, B minibatch, O observation, X proprioception x_t, A action,
-K history, S seeds.
+Shapes: T rollout steps, N environments, B minibatch, O observation, X proprioception x_t, A action, K history, S seeds.
 """
 
 from dataclasses import dataclass
@@ -42,7 +41,7 @@ class Args:
     policy: str | None = None  # start from actor and critic of this policy.msgpack, e.g. to make it robust
     load_into: Literal["both", "actor", "critic", "history_encoder", "shuffled"] = "both"  # see `warm_start`
     # Deviation (weight init): rsl_rl has PyTorch's; with orthogonal weights both quadrupeds learn faster.
-    weight_init: Literal["orthogonal", "pytorch"] = "orthogonal"  # of all layers that are not loaded
+    weight_init: Literal["orthogonal", "pytorch", "pytorch_unscaled"] = "orthogonal"  # of layers that are not loaded
     preset: Literal["smoke", "cpu", "gpu"] = "cpu"  # scale: 4, 256 or 4096 environments
     seed: int = 0  # the only source of randomness
     num_seeds: int = 1  # train seed, seed + 1, ... in one program, each in its own run folder
@@ -68,7 +67,7 @@ class Args:
     num_epochs: int = 5  # passes over each rollout
     num_minibatches: int = 4  # B = N * T / num_minibatches
     lr: float = 1e-3  # initial Adam step size, adapted to the KL
-    desired_kl: float = 0.01  # the step size keeps the KL of a minibatch step within a factor 2 of this
+    desired_kl: float | None = None  # the step size keeps the KL of a minibatch step within a factor 2 of this
     gamma: float = 0.99  # discount per control step
     gae_lambda: float = 0.95  # bias/variance trade-off of the advantage
     clip: float = 0.2  # of the probability ratio and of the value
@@ -101,9 +100,9 @@ def merge(args, ppo):
     method = "mlp" if network == "mlp" else f"pidm_{loaded}"
     seed = f"/seed{args.seed}" * (args.num_seeds == 1)
     values = {"network": network, "run_dir": f"runs/{envs.label(args.task, args.robot)}/{method}{seed}"}
-    values |= {"hidden": ppo["hidden"], "init_std": ppo["init_std"], "entropy_coef": ppo["entropy"]}
-    values |= {"intention": ppo.get("intention"), "shuffle_blocks": jax.device_count()}
-    values |= PRESETS[args.preset] | ppo.get(args.preset, {})
+    values |= {"hidden": ppo["hidden"], "intention": ppo.get("intention"), "init_std": ppo["init_std"]}
+    values |= {"entropy_coef": ppo["entropy"], "desired_kl": ppo.get("desired_kl", 0.01)}
+    values |= {"shuffle_blocks": jax.device_count()} | PRESETS[args.preset] | ppo.get(args.preset, {})
     return records.check_minibatches(records.filled(args, values))
 
 
@@ -117,7 +116,7 @@ def dense(width, fan_in, gain, weight_init):
     def pytorch(key, shape, dtype):
         return jax.random.uniform(key, shape, dtype, -1.0, 1.0) / fan_in**0.5
 
-    if weight_init == "pytorch":
+    if weight_init != "orthogonal":
         return nn.Dense(width, kernel_init=pytorch, bias_init=pytorch)
     return nn.Dense(width, kernel_init=nn.initializers.orthogonal(gain))
 
@@ -261,12 +260,18 @@ def make_net(args, env):
     if args.network == "mlp":
         return ActorCritic(args.hidden, env.action_dim, args.init_std, args.weight_init)
     sizes = SIZES[env.robot.like]
-    wide = args.intention or sizes["goal"][:-1]  # perceptive tasks need a wider intention encoder
-    sizes = sizes | {"goal": (*wide, sizes["goal"][-1])}
-    return PIDMActorCritic(sizes, env.prop_dim, env.action_dim, args.init_std, args.weight_init)
+    goal = (*(args.intention or sizes["goal"][:-1]), sizes["goal"][-1])  # perceptive tasks need a wider one
+    return PIDMActorCritic(sizes | {"goal": goal}, env.prop_dim, env.action_dim, args.init_std, args.weight_init)
 
 
 # --- Warm start ---
+
+
+def shrink_first_actions(params):
+    """Scale the actor's last layer, in place, so that the first mean actions are almost 0 (paper Sec. IV-E)."""
+    actor = params["params"]["actor"]
+    *_, last = actor.get("action_synthesizer", actor).values()  # layers of a PIDM's synthesizer, or of the MLP
+    last.update({name: 0.01 * x for name, x in last.items()})
 
 
 def shuffle_weights(tree, key):
@@ -280,8 +285,7 @@ def warm_start(args, env, params, key):
     """Set a PIDM's input normalisation and, with --pretrained, load history_encoder and backbone (paper Sec. IV-E).
 
     --load-into chooses the branches; history_encoder loads this part alone. Without --pretrained the normalisation is
-    that of the robot's shipped checkpoint, so that compared runs differ in weights alone. UserError if the checkpoint
-    was made for another robot, layout of x or K.
+    the robot's shipped one: compared runs differ in weights alone. UserError if made for another robot, x or K.
     """
     path = Path(args.pretrained or SHIPPED / f"{env.robot.name}.msgpack")
     core = {name: params["params"]["actor"][name] for name in ("history_encoder", "backbone")}
@@ -340,12 +344,10 @@ def rollout(args, env, net, params, env_state, key):
         inputs = net.inputs(env_state.obs, env_state.history)
         mean, log_std, value = net.apply(params, inputs)
         action = mean + jnp.exp(log_std) * jax.random.normal(key, mean.shape)
-        # step the environments, which reset themselves
-        env_state = jax.vmap(env.step)(env_state, action)
+        env_state = jax.vmap(env.step)(env_state, action)  # environments reset themselves
         done = env_state.terminated | env_state.truncated
         # Deviation (time limits): rsl_rl bootstraps with V of the observation before the step, which is not the last.
-        final_inputs = net.inputs(env_state.final_obs, env_state.final_history)
-        final_value = net.apply(params, final_inputs, method=net.value)
+        final_value = net.apply(params, net.inputs(env_state.final_obs, env_state.final_history), method=net.value)
         bootstrap = args.gamma * final_value * (env_state.truncated if env.bootstrap_time_outs else 0.0)
         logp = log_prob(mean, log_std, action)
         roll = Rollout(inputs, action, mean, logp, value, env_state.reward, bootstrap, done)
@@ -370,8 +372,7 @@ def gae(args, reward, done, value, last_value):
         advantage = delta + args.gamma * args.gae_lambda * (1 - done) * advantage
         return (advantage, value), advantage
 
-    init = jnp.zeros_like(last_value), last_value
-    _, advantage = jax.lax.scan(backward, init, (reward, done, value), reverse=True)
+    _, advantage = jax.lax.scan(backward, (jnp.zeros_like(last_value), last_value), (reward, done, value), reverse=True)
     return advantage, advantage + value
 
 
@@ -401,16 +402,13 @@ def ppo_loss(args, env, net, params, log_std_old, batch, key):
     """Total loss of one minibatch (leading axis B), and its parts for the log."""
     roll, advantage, ret = batch
     mean, log_std, value = net.apply(params, roll.inputs)
-
     # clipped surrogate
     ratio = jnp.exp(log_prob(mean, log_std, roll.action) - roll.log_prob)
     clipped = jnp.clip(ratio, 1 - args.clip, 1 + args.clip)
     policy_loss = -jnp.minimum(ratio * advantage, clipped * advantage).mean()
-
     # clipped value loss
     value_clipped = roll.value + jnp.clip(value - roll.value, -args.clip, args.clip)
     value_loss = jnp.maximum((value - ret) ** 2, (value_clipped - ret) ** 2).mean()
-
     entropy = jnp.sum(log_std + 0.5 * jnp.log(2 * jnp.pi * jnp.e))
     loss = policy_loss + args.value_coef * value_loss - args.entropy_coef * entropy
     parts = {"policy_loss": policy_loss, "value_loss": value_loss, "entropy": entropy}
@@ -513,6 +511,8 @@ def init_state(args, env, net, opt):
     clocks = jax.random.randint(k_clock, (args.num_envs,), 0, env.episode_steps)
     env_state = jax.jit(jax.vmap(env.reset))(jax.random.split(k_env, args.num_envs), clocks)
     params = net.init(k_net, net.inputs(env_state.obs, env_state.history))
+    if args.weight_init == "pytorch":  # orthogonal last layers are small already, pytorch_unscaled keeps PyTorch's
+        shrink_first_actions(params)
     params = warm_start(args, env, params, jax.random.fold_in(key, 1)) if args.network == "pidm" else params
     params = records.load_policy(args.policy, params, env) if args.policy else params
     return TrainState(params, opt.init(params), jnp.float32(args.lr), env_state, key, jnp.zeros((), jnp.int32))

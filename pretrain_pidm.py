@@ -50,9 +50,10 @@ class Args:
     noise: float = 1.0  # multiplies the tasks' sensor noise
     mirror: bool = True  # mirror half of the samples, for each symmetry of the robot
     # --- Training (ours; the paper gives the L1 loss and 100 epochs) ---
-    epochs: int | None = None  # passes over the data
+    epochs: int | None = None  # passes over the data; with --patience at most
     batch: int | None = None  # B
     lr: float = 1e-3  # initial Adam step size; falls to 0 along a cosine
+    patience: int | None = None  # it falls once the error has not fallen for so many epochs, and in as many
     # --- Devices ---
     distributed: bool = False  # this is one of several processes, one per host; process 0 writes the files
 
@@ -70,6 +71,8 @@ def merge(args, robot):
     args = records.filled(args, PRESETS[args.preset] | {"run_dir": f"runs/pidm/{robot}/seed{args.seed}"})
     if args.batch % jax.device_count():
         raise records.UserError(f"--batch {args.batch} cannot be split over {jax.device_count()} devices")
+    if args.patience and args.patience >= args.epochs:
+        raise records.UserError(f"--patience {args.patience} needs more --epochs than {args.epochs}")
     return args
 
 
@@ -83,7 +86,7 @@ def dense(width, fan_in, gain, weight_init):
     def pytorch(key, shape, dtype):
         return jax.random.uniform(key, shape, dtype, -1.0, 1.0) / fan_in**0.5
 
-    if weight_init == "pytorch":
+    if weight_init != "orthogonal":
         return nn.Dense(width, kernel_init=pytorch, bias_init=pytorch)
     return nn.Dense(width, kernel_init=nn.initializers.orthogonal(gain))
 
@@ -272,22 +275,36 @@ def l1_loss(net, variables, batch):
 # --- Training ---
 
 
+def decay(args, past):
+    """Epochs at which the step size begins to fall and is 0, by the validation errors of past epochs.
+
+    It falls all the time or, with --patience, once so many epochs brought no lower error, or no more are left.
+    """
+    if args.patience is None:
+        return 0, args.epochs
+    flat = (n for n in range(1, len(past) + 1) if n - 1 - np.argmin(past[:n]) >= args.patience)
+    start = min(next(flat, args.epochs), args.epochs - args.patience)
+    return start, start + args.patience
+
+
 def make_step(args, env, net, opt):
     """One Adam step on an augmented batch, compiled."""
 
     @partial(jax.jit, out_shardings=devices.same())
-    def step(variables, opt_state, batch, key):
+    def step(variables, opt_state, batch, key, lr):
         batch = augment(args, env, key, batch)
         loss, grads = jax.value_and_grad(lambda p: l1_loss(net, variables | {"params": p}, batch))(variables["params"])
         updates, opt_state = opt.update(grads, opt_state)
-        return variables | {"params": optax.apply_updates(variables["params"], updates)}, opt_state, loss
+        params = jax.tree.map(lambda p, u: p - lr * u, variables["params"], updates)
+        return variables | {"params": params}, opt_state, loss
 
     return step
 
 
-def run_epoch(args, data, index, step, state, epoch):
+def run_epoch(args, data, index, step, state, past):
     """One pass over the training transitions, in an order that (seed, epoch) alone decides. Also the mean loss."""
-    variables, opt_state = state
+    (variables, opt_state), epoch = state, len(past)
+    start, end = decay(args, past)
     order = np.random.default_rng((args.seed, epoch)).permutation(index)
     size = min(args.batch, len(order) // jax.device_count() * jax.device_count())
     whole = len(order) - len(order) % size  # no ragged last batch
@@ -295,9 +312,11 @@ def run_epoch(args, data, index, step, state, epoch):
     for number, batch in enumerate(batches(data, order[:whole], size)):
         batch = devices.place(batch, dict.fromkeys(batch, devices.split(0)))
         key = jax.random.fold_in(jax.random.fold_in(jax.random.key(args.seed), epoch), number)
-        variables, opt_state, loss = step(variables, opt_state, batch, key)
+        share = max(epoch + number * size / whole - start, 0) / (end - start)
+        lr = np.float32(args.lr * (1 + np.cos(np.pi * share)) / 2)
+        variables, opt_state, loss = step(variables, opt_state, batch, key, lr)
         losses.append(loss)
-    return (variables, opt_state), float(jnp.stack(losses).mean())
+    return (variables, opt_state), float(np.mean(jax.device_get(losses)))
 
 
 def init_variables(args, env, net, windows):
@@ -311,17 +330,14 @@ def init_variables(args, env, net, windows):
 def pretrain(args):
     """Train, keep the weights of the best epoch, and validate them."""
     data, env = open_data(args)
-    robot = env.robot.name
-    args = merge(args, robot)
+    args = merge(args, env.robot.name)
     count = len(data.train) if args.num_samples is None else args.num_samples
     if count > len(data.train):
         raise records.UserError(f"--num-samples {count} is not within 1 and the {len(data.train)} in {args.data}")
     index = np.random.default_rng(args.seed).permutation(data.train)[:count]
     few = np.sort(np.random.default_rng(args.seed).permutation(data.validation)[:50_000])
-    print(f"{robot}: {count} transitions to train on, {len(data.validation)} to validate")
-
-    net = PIDM(SIZES[env.robot.like], env.action_dim)
-    opt = optax.adam(optax.cosine_decay_schedule(args.lr, args.epochs * max(count // args.batch, 1)))
+    print(f"{env.robot.name}: {count} transitions to train on, {len(data.validation)} to validate")
+    net, opt = PIDM(SIZES[env.robot.like], env.action_dim), optax.scale_by_adam()
 
     def init(args):
         variables = init_variables(args, env, net, data.windows(np.sort(index[:100_000])))
@@ -331,23 +347,24 @@ def pretrain(args):
     (state,), (folder,) = run.start(init), run.folders
     state = devices.place(state, jax.tree.map(lambda _: devices.same(), state))
     step = make_step(args, env, net, opt)
+    past = [row["error"] for row in run.rows[0]]
     with run:
-        while not run.done:
+        while not run.done and run.iteration < decay(args, past)[1]:
             epoch = run.iteration + 1
-            state, loss = run_epoch(args, data, index, step, state, epoch - 1)
+            state, loss = run_epoch(args, data, index, step, state, past)
             row = {"iteration": epoch, "samples": count * epoch, "seconds": run.seconds(), "train_error": loss}
-            row |= errors(env, data, predict_all(args, env, net, state[0], data, few))
-            run.add([metrics.rounded(row)])
+            row = metrics.rounded(row | errors(env, data, predict_all(args, env, net, state[0], data, few)))
+            run.add([row])
+            past.append(row["error"])
             if not np.isfinite(loss):
                 raise records.UserError(f"the error is not finite after epoch {epoch}; lower --lr")
-            rows = run.rows[0]
-            if folder and rows[-1]["error"] <= min(row["error"] for row in rows):
-                records.save(folder / "pidm.msgpack", state[0], checkpoint_meta(args, env, data, net.sizes, rows[-1]))
+            if folder and row["error"] == min(past):
+                records.save(folder / "pidm.msgpack", state[0], checkpoint_meta(args, env, data, net.sizes, row))
             run.save([state])
     run.report_interrupt()
     if folder:
         panels = {"normalized_error": ["normalized_error"], "L1": ["train_error", "error"]}
-        figures.plot_curves(rows, panels, folder / "curve.png", over="samples")
+        figures.plot_curves(run.rows[0], panels, folder / "curve.png", over="samples")
         print(f"wrote {folder}/pidm.msgpack, metrics.csv, curve.png")
         best, _ = records.load(folder / "pidm.msgpack", "PIDM checkpoint")
         validate(args, env, net, best, data, folder)
@@ -369,17 +386,9 @@ def open_data(args):
 
 def checkpoint_meta(args, env, data, sizes, row):
     """Description of a PIDM checkpoint, stored in it."""
-    meta = data.meta
-    return {
-        "robot": meta["robot"],
-        "body": env.config.body,
-        "layout": meta["layout"],
-        "history": meta["history"],
-        "sizes": dict(sizes),
-        "args": dataclasses.asdict(args),
-        "dataset": {name: meta[name] for name in ("transitions", "args", "versions")},
-        "metrics": row,
-    }
+    meta = {name: data.meta[name] for name in ("robot", "layout", "history")}
+    meta["dataset"] = {name: data.meta[name] for name in ("transitions", "args", "versions")}
+    return meta | {"body": env.config.body, "sizes": dict(sizes), "args": dataclasses.asdict(args), "metrics": row}
 
 
 # --- Evaluation ---
@@ -404,14 +413,9 @@ def predict_all(args, env, net, variables, data, index):
 
     for number, batch in enumerate(batches(data, index, 8192)):
         key = jax.random.fold_in(jax.random.key(1), number)
-        parts.append(
-            {
-                "predicted": np.asarray(predict_noisy(variables, batch, key)),
-                "action": batch["action"],
-                "last": batch["past"][:, -1],
-                "change": commanded_change(env, batch["prop"][:, -1], batch["action"]),
-            }
-        )
+        predicted, action = np.asarray(predict_noisy(variables, batch, key)), batch["action"]
+        change = commanded_change(env, batch["prop"][:, -1], action)
+        parts.append({"predicted": predicted, "action": action, "last": batch["past"][:, -1], "change": change})
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 

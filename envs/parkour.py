@@ -345,19 +345,11 @@ def parkour(skill, weights=(), cpu_steps=12_000_000, **changes):
         "skill": skill,
         "weights": WEIGHTS | dict(weights),
         "ppo": {
-            "hidden": (512, 256, 128),
-            # Deviation (parkour widths): The PIDM has twice the MLP's parameters, 1.4 times in preset gpu, and four
-            # times in the paper.
-            "intention": (512, 256),  # hidden widths of the PIDM's intention encoder
+            "hidden": (128, 128, 128),
+            "intention": (256, 128),  # hidden widths of the PIDM's intention encoder
             "entropy": 0.005,
             "init_std": 0.6,
-            "cpu": {
-                "num_envs": 512,
-                "num_steps": 48,
-                "total_steps": cpu_steps,
-                "hidden": (256, 128, 128),
-                "intention": (256, 128),
-            },
+            "cpu": {"num_envs": 512, "num_steps": 48, "total_steps": cpu_steps},
             "gpu": {"num_steps": 48, "total_steps": 393_000_000},
         },
         "episode_seconds": 6.0,

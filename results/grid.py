@@ -1,14 +1,22 @@
-"""Tasks and methods of the study, which study.py trains and report.py reads.
+"""The study: its tasks, methods and scales, and the plan of its runs, which study.py trains and report.py reads.
 
-Their names are folders under results/study; those that have recorded runs must stay.
+Names of scales, tasks and methods are folders under results/study; those that have recorded runs must stay.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 SHIPPED = "--pretrained assets/pidm/{robot}.msgpack"
 PART = "--pretrained results/pidm/{robot}/sizes"  # made by pidm.py --stages sizes
-PAPER = "--weight-init pytorch"  # rsl_rl's, a fork of which the paper used
+PAPER = "--weight-init {weights}"  # as in rsl_rl, a fork of which the paper used
+UNSCALED = "--weight-init pytorch_unscaled"
+
+
+@dataclass(frozen=True)
+class Task:
+    """A task of the paper."""
+
+    title: str  # in tables and figures
 
 
 @dataclass(frozen=True)
@@ -17,17 +25,40 @@ class Method:
 
     title: str  # in tables and figures
     group: Literal["table 1", "table 2", "sizes", "beyond the paper"]  # its section of the report
-    flags: str  # of ppo_finetune.py; {robot} is the task's
+    flags: str  # of ppo_finetune.py; {robot} is the task's, {weights} those of the scale
 
 
 @dataclass(frozen=True)
-class Task:
-    """A task and the methods that the study compares on it."""
+class Scale:
+    """What all runs in a folder of results/study have in common."""
 
-    title: str  # in tables and figures
+    preset: str = "cpu"
+    flags: dict[str, str] = field(default_factory=dict)  # task -> flags of ppo_finetune.py that go before the preset's
+    weights: str = "pytorch"  # initial ones, of the methods of the paper
+
+
+@dataclass(frozen=True)
+class Block:
+    """Runs that answer one question: each of the tasks with each method and seed."""
+
+    why: str
+    scale: str
+    tasks: tuple[str, ...]
     methods: tuple[str, ...]
-    steps: int | None = None  # at scale cpu, where the preset has too few for the PIDM to converge, or far too many
+    seeds: range
 
+
+TASKS = {  # in the paper's order
+    "anymal_loco": Task("ANYmal D locomotion"),
+    "anymal_pedipulation": Task("Pedipulation"),
+    "anymal_parkour_walk": Task("Parkour walk"),
+    "anymal_climb_up": Task("Climb up"),
+    "anymal_climb_down": Task("Climb down"),
+    "anymal_crouch": Task("Crouch"),
+    "anymal_jump": Task("Jump"),
+    "go1_loco": Task("Go1 locomotion"),
+    "g1_loco": Task("G1 locomotion"),
+}
 
 METHODS = {
     "mlp": Method("MLP", "table 1", f"--network mlp {PAPER}"),
@@ -47,6 +78,8 @@ METHODS = {
         "beyond the paper",
         f"{SHIPPED} --load-into history_encoder",
     ),
+    "pidm_random_unscaled": Method("PIDM random, unscaled", "beyond the paper", f"--network pidm {UNSCALED}"),
+    "pidm_pretrained_unscaled": Method("PIDM pretrained, unscaled", "beyond the paper", f"{SHIPPED} {UNSCALED}"),
 }
 
 
@@ -55,21 +88,59 @@ def titles(*groups):
     return {name: method.title for name, method in METHODS.items() if method.group in groups}
 
 
-TABLE_1 = tuple(titles("table 1"))
-ABLATIONS = tuple(titles("table 2", "sizes"))
-ORTHOGONAL = tuple(name for name in METHODS if name.endswith("_orthogonal"))
+GO1, ANYMAL, G1, PEDIPULATION = ("go1_loco",), ("anymal_loco",), ("g1_loco",), ("anymal_pedipulation",)
+CLIMB_UP, CLIMB_DOWN = ("anymal_climb_up",), ("anymal_climb_down",)
+OTHERS = ("anymal_parkour_walk", "anymal_crouch", "anymal_jump")
+SKILLS = OTHERS + CLIMB_UP + CLIMB_DOWN
 
-TASKS = {  # in the paper's order
-    "anymal_loco": Task("ANYmal D locomotion", (*TABLE_1, *ORTHOGONAL, "pidm_shuffled")),
-    "anymal_pedipulation": Task("Pedipulation", (*TABLE_1, "pidm_shuffled"), 6_000_000),
-    "anymal_parkour_walk": Task("Parkour walk", TABLE_1),
-    "anymal_climb_up": Task("Climb up", (*TABLE_1, *ABLATIONS, "pidm_shuffled")),
-    "anymal_climb_down": Task("Climb down", (*TABLE_1, *ABLATIONS, "pidm_shuffled")),
-    "anymal_crouch": Task("Crouch", TABLE_1),
-    "anymal_jump": Task("Jump", TABLE_1),
-    "go1_loco": Task("Go1 locomotion", (*TABLE_1, *ORTHOGONAL, "pidm_shuffled"), 6_000_000),
-    "g1_loco": Task("G1 locomotion", (*TABLE_1, "pidm_shuffled"), 12_000_000),
+TABLE_1, TABLE_2, PARTS = (tuple(titles(group)) for group in ("table 1", "table 2", "sizes"))
+PIDMS = ("pidm_random", "pidm_pretrained")
+ORTHOGONAL = ("pidm_random_orthogonal",)
+CONTROLS = (*ORTHOGONAL, "pidm_pretrained_orthogonal", "pidm_shuffled")
+UNSCALED_PIDMS = ("pidm_random_unscaled", "pidm_pretrained_unscaled")
+
+
+def blind(num_envs, total_steps, log_every):
+    """Flags of the quadrupeds' blind tasks."""
+    flags = f"--num-envs {num_envs} --total-steps {total_steps} --log-every {log_every}"
+    return dict.fromkeys(GO1 + ANYMAL + PEDIPULATION, flags)
+
+
+SIX_MILLION = dict.fromkeys(GO1 + PEDIPULATION, "--total-steps 6000000")
+G1_AT_1024 = {"g1_loco": "--num-envs 1024 --total-steps 12000000 --log-every 4"}
+SCALES = {
+    # Recorded with earlier PIDMs, and with G1's and parkour's tasks as they were. Nothing is added to it.
+    "cpu": Scale(flags=SIX_MILLION | {"g1_loco": "--total-steps 12000000 --desired-kl 0.01"}, weights="pytorch_unscaled"),
+    "256": Scale(flags=blind(256, 6_000_000, 10)),
+    "1024": Scale(flags=blind(1024, 10_000_000, 4)),
+    # The paper's 4096 x 24. G1 and parkour need more iterations: 1024 x 24, and 512 x 48 by the preset.
+    "batch": Scale(flags=blind(4096, 14_000_000, 1) | G1_AT_1024),
+    "gpu": Scale("gpu"),
+    "smoke": Scale("smoke"),
 }
+
+PLAN = (  # in the order in which it is run
+    Block("Table I: Go1 at the paper's batch, where it was not helped at 256", "batch", GO1, TABLE_1, range(5)),
+    Block("Table I: ANYmal D at the paper's batch", "batch", ANYMAL, TABLE_1, range(3)),
+    Block("is it knowledge, or the size of the initial weights? Go1", "batch", GO1, CONTROLS, range(3)),
+    Block("is it knowledge, or the size of the initial weights? ANYmal D", "batch", ANYMAL, CONTROLS, range(1)),
+    Block("what pretraining brings, over the batch", "1024", GO1 + ANYMAL, PIDMS, range(2)),
+    Block("what first mean actions of almost 0 bring", "batch", GO1, UNSCALED_PIDMS, range(2)),
+    Block("Table I: G1 with its gait clock", "batch", G1, TABLE_1, range(3)),
+    Block("Table I: parkour where success is to stand", "batch", SKILLS, TABLE_1, range(2)),
+    Block("Table II: the actor or the critic alone", "batch", CLIMB_UP + CLIMB_DOWN, TABLE_2, range(1)),
+    Block("how many transitions pretraining needs", "batch", CLIMB_UP + CLIMB_DOWN, PARTS, range(1)),
+    Block("orthogonal weights without data", "batch", CLIMB_UP, ORTHOGONAL, range(1)),
+    # The results need all above. What follows makes them firmer.
+    Block("third seeds of parkour", "batch", SKILLS, TABLE_1, range(2, 3)),
+    Block("second seeds of Table II and sizes", "batch", CLIMB_UP + CLIMB_DOWN, TABLE_2 + PARTS, range(1, 2)),
+    Block("Table I: pedipulation at the paper's batch", "batch", PEDIPULATION, TABLE_1, range(3)),
+    Block("orthogonal weights without data, other skills", "batch", OTHERS + CLIMB_DOWN, ORTHOGONAL, range(1)),
+    Block("256 environments with the PIDMs of the other batches", "256", GO1 + ANYMAL, PIDMS, range(2)),
+    # Only if asked for by --scales.
+    Block("Table I at the paper's scale, for a GPU", "gpu", tuple(TASKS), TABLE_1, range(5)),
+    Block("does the study run?", "smoke", GO1, TABLE_1, range(1)),
+)
 
 # Fields that the config of an older run lacks, at the values that leave its task as it was.
 LATER = {

@@ -5,9 +5,11 @@
     python results/pidm.py --robots anymal_d --stages sizes
     python results/pidm.py --stages collect validate
 
+It makes them at the paper's size: 7.6 M transitions of a robot, of which 0.6 M are for validation, and at most 100
+epochs. Files take 1.4 GB (G1 2.9).
 Weights go to assets/pidm/<robot>.msgpack, everything else to results/pidm/<robot>. Stage `sizes` also pretrains on
-small random parts of the data (paper Sec. V-D), into results/pidm/<robot>/sizes. Stage `validate` measures the shipped
-weights again, on the data of stage `collect`.
+small random parts of the same data (paper Sec. V-D), into results/pidm/<robot>/sizes. Stage `validate` measures the
+shipped weights again, on the data of stage `collect`.
 """
 
 import json
@@ -34,7 +36,9 @@ import ppo_finetune
 import pretrain_pidm
 from experiment import devices, figures, records
 
-SIZES = (7_000, 70_000, 700_000)  # transitions
+SIZES = (7_000, 70_000, 700_000)  # transitions; the fourth of the paper's sizes, 7 M, is the shipped PIDM
+EXPLORE = ("--total-steps", "7600000")
+PRETRAIN = ("--epochs", "100", "--patience", "10")
 EARLY = 100  # iterations of a task's training whose states the coverage figure shows (paper Fig. 4a)
 
 
@@ -53,6 +57,11 @@ class Args:
 def run(*words):
     """Run a script in a process of its own."""
     subprocess.run([sys.executable, *words], cwd=ROOT, check=True)
+
+
+def at_size(args, words):
+    """These words, which set the paper's size, unless it is a smoke test."""
+    return () if args.preset == "smoke" else words
 
 
 def copy(source, target):
@@ -87,7 +96,7 @@ def pretrain_on_parts(args, robot):
     for size in SIZES:
         folder = f"runs/pidm/{robot}/{size}"
         words = ("--data", f"runs/explore/{robot}/seed0", "--num-samples", str(size), "--run-dir", folder)
-        run("pretrain_pidm.py", *words, "--preset", args.preset, "--force")
+        run("pretrain_pidm.py", *words, "--preset", args.preset, "--force", *at_size(args, PRETRAIN))
         for name, suffix in (("pidm", "msgpack"), ("validation", "json"), ("metrics", "csv"), ("args", "json")):
             stem = str(size) if name == "pidm" else f"{size}_{name}"
             copy(ROOT / folder / f"{name}.{suffix}", ROOT / f"results/pidm/{robot}/sizes/{stem}.{suffix}")
@@ -170,9 +179,9 @@ def first_features(task, **choice):
 def compare_features(robot, task):
     """`first_features` of a new, a loaded and a shuffled PIDM."""
     loaded = {"pretrained": str(ROOT / f"assets/pidm/{robot}.msgpack")}
-    choices = {"fresh, orthogonal": {}, "fresh, as PyTorch's": {"weight_init": "pytorch"}}
+    choices = {"fresh, orthogonal": {}, "fresh, as PyTorch's": {"weight_init": "pytorch_unscaled"}}
     choices |= {"loaded": loaded, "loaded and shuffled": loaded | {"load_into": "shuffled"}}
-    choices |= {"loaded, the rest as PyTorch's": loaded | {"weight_init": "pytorch"}}
+    choices |= {"loaded, the rest as PyTorch's": loaded | {"weight_init": "pytorch_unscaled"}}
     found = {name: first_features(task, **choice) for name, choice in choices.items()}
     return {f"features in {task}, {what}, {name}": x for name, facts in found.items() for what, x in facts.items()}
 
@@ -267,16 +276,11 @@ def look(args, robot):
 
 HEAD = """# Shipped PIDM checkpoints
 
-Made by `python results/pidm.py`, which runs, for each robot,
-
-    python ppo_explore.py --robot ROBOT
-    python pretrain_pidm.py --data runs/explore/ROBOT/seed0
+Made by `python results/pidm.py`, which runs the commands that stand below for each robot.
 
 Errors are on held-out environments, with the tasks' sensor noise. error_over_change is error_rad over the mean action
 magnitude |a_t - q_t|, joint target minus joint angle: the paper's normalised error, 0.4 to 0.5 there. normalized_error
-is over the mean action. Errors were measured (`--stages collect validate`) on collections that the same commands made
-on another machine. These differ in their bits, so the weights have seen nothing of them. The last row of metrics.csv is
-on the collection of the training.
+is over the mean action.
 
 Joint space is the share of a 20 x 20 grid over each pair of neighbouring joints of a limb that 20,000 samples visit.
 Disagreement is that of an ensemble trained on the first tenth of the collection, there (seen) and on the last tenth
@@ -284,20 +288,34 @@ Disagreement is that of an ensemble trained on the first tenth of the collection
 outputs of the actor's backbone in the first rollout of a task. Their effective rank (Roy and Vetterli 2007) is the
 number of directions, of 64, that they fill. The study's pretrained arm is "loaded, the rest as PyTorch's".
 
-G1's data were made with 0.5 rad per unit of action for every joint. Its checkpoint has had its action normalisation
-rescaled to the present action scales, which leaves the function it computes as it was.
-
 """
+FIRST = """Of {robots}: errors were measured (`--stages collect validate`) on a collection that these commands made on
+another machine. It differs in its bits, so the weights have seen nothing of it. The last row of metrics.csv is on the
+collection of the training. G1's data were made with 0.5 rad per unit of action for every joint. Its checkpoint has had
+its action normalisation rescaled to the present action scales, which leaves the function it computes as it was.
+
+"""  # of weights from 1.5 M transitions; goes with the last of them
+
+
+def commands(robot, explored, trained):
+    """Lines that say how a PIDM was made, from the arguments of both stages."""
+    lines = [f"    python ppo_explore.py --robot {robot} --total-steps {explored['total_steps']}"]
+    words = [f"--{name} {trained[name]}" for name in ("epochs", "patience") if trained.get(name)]
+    return [*lines, f"    python pretrain_pidm.py --data runs/explore/{robot}/seed0 {' '.join(words)}"]
 
 
 def write_readme():
     """Write results/pidm/README.md from the kept files of all robots."""
-    lines = []
+    lines, first = [], []
     for folder in sorted(path for path in (ROOT / "results/pidm").iterdir() if path.is_dir()):
         meta, result = (json.loads((folder / name).read_text()) for name in ("explore/meta.json", "validation.json"))
         for extra in (folder / "coverage.json", folder / "features.json"):
             result |= json.loads(extra.read_text()) if extra.exists() else {}
-        lines += [f"## {folder.name}", "", f"{meta['transitions']:,} transitions.", ""]
+        trained = json.loads((folder / "args.json").read_text())
+        epochs = len((folder / "metrics.csv").read_text().splitlines()) - 1
+        lines += [f"## {folder.name}", "", f"{meta['transitions']:,} transitions, {epochs} epochs.", ""]
+        lines += [*commands(folder.name, meta["args"], trained), ""]
+        first += [folder.name] if meta["transitions"] < 7_000_000 else []
         lines += [
             "| what | figure |",
             "|---|---|",
@@ -307,17 +325,18 @@ def write_readme():
         pictures = ("curve", "accuracy", "distribution", "coverage", "novelty", "explore/curve")
         drawn = [name for name in pictures if (folder / f"{name}.png").exists()]
         lines += [*(f"![{name}]({folder.name}/{name}.png)" for name in drawn), ""]
-    records.replace_text(ROOT / "results/pidm/README.md", HEAD + "\n".join(lines).rstrip() + "\n")
+    head = HEAD + (FIRST.format(robots=", ".join(first)) if first else "")
+    records.replace_text(ROOT / "results/pidm/README.md", head + "\n".join(lines).rstrip() + "\n")
 
 
 def main(args):
     devices.find()
     for robot in args.robots:
         if "collect" in args.stages:
-            run("ppo_explore.py", "--robot", robot, "--preset", args.preset, "--force")
+            run("ppo_explore.py", "--robot", robot, "--preset", args.preset, "--force", *at_size(args, EXPLORE))
         if "pretrain" in args.stages:
             data = f"runs/explore/{robot}/seed0"
-            run("pretrain_pidm.py", "--data", data, "--preset", args.preset, "--force")
+            run("pretrain_pidm.py", "--data", data, "--preset", args.preset, "--force", *at_size(args, PRETRAIN))
             keep(robot)
         if "validate" in args.stages:
             validate(robot)

@@ -52,6 +52,7 @@ CONTROLS = (  # method, and the one that it is compared with
     ("pidm_history_orthogonal", "pidm_random_orthogonal"),
     ("pidm_pretrained", "pidm_random_orthogonal"),
     ("mlp_orthogonal", "mlp"),
+    ("pidm_pretrained_unscaled", "pidm_random_unscaled"),
 )
 
 

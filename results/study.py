@@ -1,16 +1,14 @@
-"""The paper's comparison: train and evaluate tasks x methods x seeds with ppo_finetune.py, and keep the records.
+"""The paper's comparison: train and evaluate what grid.py plans with ppo_finetune.py, and keep the records.
 
     python results/study.py --status
     python results/study.py --tasks go1_loco --seeds 0 1 2 --budget-minutes 120
     python results/study.py --list | parallel -j 8
 
-It trains what is missing and resumes what was interrupted. A run uses the cores it may. Two at once, each pinned to one
-of two cores (`taskset -c 0`), make 15 to 25% more steps.
+It trains what is missing, in the order of the plan, and resumes what was interrupted. A run uses the cores it may. Two
+at once, each pinned to one of two cores (`taskset -c 0`), make 15 to 25% more steps.
 
-Without --tasks, --methods and --seeds it is the whole of grid.py: Table I of the paper (nine tasks, three methods, five
-seeds), Table II (actor or critic alone), the sizes of the pretraining set, and, beyond the paper, shuffled weights and
-orthogonal initial weights. A run is in runs/study/<scale>/<task>/<method>/seed<k>. Its small files are kept in the same
-folder under results, where report.py reads them. Scales never mix.
+A run is in runs/study/<scale>/<task>/<method>/seed<k>. Its small files are kept in the same folder under results, where
+report.py reads them. Scales never mix.
 """
 
 import csv
@@ -20,7 +18,6 @@ import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import tyro
 
@@ -30,20 +27,22 @@ sys.path.insert(0, str(ROOT))
 import envs
 from experiment import records
 from results import recording
-from results.grid import METHODS, TASKS
+from results.grid import METHODS, PLAN, SCALES, TASKS
 
 KEPT = ("args.json", "metrics.csv", "eval.json")
 
 
 @dataclass(frozen=True)
 class Args:
-    tasks: tuple[str, ...] = tuple(TASKS)
-    methods: tuple[str, ...] | None = None  # None: those of each task in grid.py
-    seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
-    scale: Literal["smoke", "cpu", "gpu"] = "cpu"  # preset
+    """Without tasks, methods or seeds it is all of them that are planned."""
+
+    tasks: tuple[str, ...] = ()
+    methods: tuple[str, ...] = ()
+    seeds: tuple[int, ...] = ()
+    scales: tuple[str, ...] = ("batch", "1024", "256")
     budget_minutes: float = 1e9  # stop after this time; the same command goes on
     list: bool = False  # print one command for each missing run, and train nothing
-    status: bool = False  # print what has been trained, and train nothing
+    status: bool = False  # print what has been trained and what each run is for, and train nothing
 
 
 @dataclass(frozen=True)
@@ -65,10 +64,10 @@ class Cell:
         run = ROOT / "runs" / self.folder
         if (run / records.STATE).exists():
             return ["--resume", f"runs/{self.folder}"]
-        robot, steps = envs.TASKS[self.task][1].robot, TASKS[self.task].steps
-        words = ["--task", self.task, "--preset", self.scale, "--seed", str(self.seed)]
-        words += METHODS[self.method].flags.format(robot=robot).split()
-        words += ["--total-steps", str(steps)] if self.scale == "cpu" and steps else []
+        robot, scale = envs.TASKS[self.task][1].robot, SCALES[self.scale]
+        words = ["--task", self.task, "--preset", scale.preset, "--seed", str(self.seed)]
+        words += METHODS[self.method].flags.format(robot=robot, weights=scale.weights).split()
+        words += scale.flags.get(self.task, "").split()
         return [*words, "--run-dir", f"runs/{self.folder}", "--force"]
 
     def done(self):
@@ -84,25 +83,46 @@ class Cell:
             return None
 
 
-def cells(args):
-    """Runs in order: one seed of every method before the next seed, so that an unfinished study can be compared."""
-    for task in args.tasks:
-        for seed in args.seeds:
-            for method in args.methods or TASKS[task].methods:
-                yield Cell(args.scale, task, method, seed)
+def planned(args):
+    """Blocks of the plan with those of their runs that the arguments choose. UserError for a name that is unknown.
+
+    One seed of every task and method comes before the next seed, so that an unfinished block can be compared.
+    """
+    for kind, known in {"tasks": TASKS, "methods": METHODS, "scales": SCALES}.items():
+        for name in {*getattr(args, kind)} - known.keys():
+            raise records.UserError(f"unknown name {name!r} in --{kind}; known: {', '.join(known)}")
+
+    def chosen(kind, names):
+        return [name for name in names if name in (getattr(args, kind) or names)]
+
+    runs = {
+        block: [
+            Cell(block.scale, task, method, seed)
+            for seed in chosen("seeds", block.seeds)
+            for task in chosen("tasks", block.tasks)
+            for method in chosen("methods", block.methods)
+        ]
+        for block in PLAN
+        if block.scale in args.scales
+    }
+    if not any(runs.values()):
+        raise records.UserError("no such run is planned; --status shows those that are, and results/grid.py plans them")
+    return {block: cells for block, cells in runs.items() if cells}
 
 
 def show_status(runs):
-    """Print a line for each task and method: `x` for a finished seed, a percentage for a part, `.` for none."""
-    marks = {}
-    for cell in runs:
-        done = cell.done()
-        mark = "." if done is None else "x" if done == 1.0 else f"{100 * done:.0f}%"
-        marks.setdefault((cell.task, cell.method), []).append(mark)
-    for (task, method), seeds in marks.items():
-        print(f"{task:20}{method:28}{' '.join(seeds)}")
-    count = sum(seeds.count("x") for seeds in marks.values())
-    print(f"{count} of {sum(map(len, marks.values()))} runs")
+    """Print the runs of each block: `x` for a finished seed, a percentage for a part, `.` for none."""
+    for block, cells in runs.items():
+        print(f"{block.scale}: {block.why}")
+        marks = {}
+        for cell in cells:
+            done = cell.done()
+            mark = "." if done is None else "x" if done == 1.0 else f"{100 * done:.0f}%"
+            marks.setdefault((cell.task, cell.method), []).append(mark)
+        for (task, method), seeds in marks.items():
+            print(f"  {task:20}{method:28}{' '.join(seeds)}")
+    every = [cell.done() == 1.0 for cells in runs.values() for cell in cells]
+    print(f"{sum(every)} of {len(every)} runs")
 
 
 def run(cell, seconds):
@@ -117,17 +137,15 @@ def run(cell, seconds):
 
 
 def main(args):
-    for name in {*args.tasks} - TASKS.keys() | {*(args.methods or ())} - METHODS.keys():
-        raise records.UserError(f"unknown task or method {name!r}; known: {', '.join([*TASKS, *METHODS])}")
-    runs = list(cells(args))
+    runs = planned(args)
     if args.status:
         return show_status(runs)
-    missing = [cell for cell in runs if cell.done() != 1.0]
+    missing = [cell for cells in runs.values() for cell in cells if cell.done() != 1.0]
     start = time.perf_counter()
     for cell in missing:
         left = 60 * args.budget_minutes - (time.perf_counter() - start)
         if args.list:
-            words = f"--tasks {cell.task} --methods {cell.method} --seeds {cell.seed} --scale {cell.scale}"
+            words = f"--tasks {cell.task} --methods {cell.method} --seeds {cell.seed} --scales {cell.scale}"
             print(f"python results/study.py {words}")
         elif left <= 0 or not run(cell, left):
             return print("out of time; the same command goes on")

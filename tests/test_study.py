@@ -13,8 +13,10 @@ from experiment import records
 from results import grid, recording, report, study
 
 # Tasks that were changed after their runs were recorded, as results/README.md says; take out what is recorded anew.
-CHANGED = {*(task for task, (_, config) in envs.TASKS.items() if hasattr(config, "skill")), "g1_loco"}
+SKILLS = tuple(task for task, (_, config) in envs.TASKS.items() if hasattr(config, "skill"))
+CHANGED = {*SKILLS, "g1_loco"}
 FREE = {"run_dir", "save_minutes", "shuffle_blocks"}  # arguments that may differ from those of a recorded run
+WIDTHS = {"hidden", "intention"}  # likewise in parkour, whose MLP had 256 units in its first layer
 
 
 @pytest.fixture
@@ -43,19 +45,21 @@ def runs(tmp_path, monkeypatch):
 
 
 def test_a_study_resumes_what_was_interrupted(runs, capsys):
-    args = study.Args(tasks=("go1_loco",), methods=("mlp", "pidm_actor"), seeds=(3,))
+    args = study.Args(tasks=("go1_loco",), methods=("mlp", "pidm_shuffled"), seeds=(2,))
     study.main(args)
     assert "out of time" in capsys.readouterr().out and len(runs) == 1
-    study.show_status(study.cells(args))
-    assert " ".join(capsys.readouterr().out.split()) == "go1_loco mlp 50% go1_loco pidm_actor . 0 of 2 runs"
+    study.show_status(study.planned(args))
+    *lines, count = [" ".join(line.split()) for line in capsys.readouterr().out.splitlines()]
+    assert lines[1::2] == ["go1_loco mlp 50%", "go1_loco pidm_shuffled ."] and count == "0 of 2 runs"
+    assert lines[::2] == [f"batch: {block.why}" for block in (grid.PLAN[0], grid.PLAN[2])]
     study.main(args)
     first, again, other = runs
-    assert first[:6] == ["--task", "go1_loco", "--preset", "cpu", "--seed", "3"]
-    assert again == ["--resume", "runs/study/cpu/go1_loco/mlp/seed3"]
-    assert other[6:10] == ["--pretrained", "assets/pidm/go1.msgpack", "--load-into", "actor"]
+    assert first[:6] == ["--task", "go1_loco", "--preset", "cpu", "--seed", "2"]
+    assert again == ["--resume", "runs/study/batch/go1_loco/mlp/seed2"]
+    assert other[6:10] == ["--pretrained", "assets/pidm/go1.msgpack", "--load-into", "shuffled"]
     study.main(args)
     assert len(runs) == 3, "nothing is run twice"
-    study.show_status(study.cells(args))
+    study.show_status(study.planned(args))
     assert "2 of 2 runs" in capsys.readouterr().out
 
 
@@ -65,14 +69,67 @@ def test_no_run_starts_when_time_is_over(runs, capsys):
 
 
 def test_list_is_a_command_a_line(runs, capsys):
+    """Each names one run, the one of its place in the plan."""
     study.main(study.Args(list=True))
     lines = capsys.readouterr().out.splitlines()
-    assert len(lines) == len(set(lines)) == 5 * sum(len(task.methods) for task in grid.TASKS.values()) and not runs
+    wanted = [cell for cells in study.planned(study.Args()).values() for cell in cells]
+    assert len(lines) == len(set(lines)) == len(wanted) > 100 and not runs
+    for line, cell in zip(lines, wanted, strict=True):
+        args = tyro.cli(study.Args, args=line.split()[2:])
+        assert [one for cells in study.planned(args).values() for one in cells] == [cell]
 
 
-def test_unknown_names_are_refused():
-    with pytest.raises(records.UserError, match="unknown task or method 'walk'"):
-        study.main(study.Args(tasks=("walk",)))
+def test_names_that_are_not_planned_are_refused():
+    unknown = ({"tasks": ("walk",)}, {"methods": ("walk",)}, {"scales": ("walk",)})
+    for choice in unknown:
+        with pytest.raises(records.UserError, match=f"unknown name 'walk' in --{next(iter(choice))}; known: "):
+            study.main(study.Args(**choice))
+    with pytest.raises(records.UserError, match="no such run is planned"):
+        study.main(study.Args(tasks=("go1_loco",), seeds=(5,)))
+
+
+def test_the_plan_has_the_cells_that_were_asked_for():
+    """Seeds by scale, task and method: a block that is lost, doubled or moved shows here."""
+    seeds = {}
+    for block, cells in study.planned(study.Args()).items():
+        for cell in cells:
+            seeds.setdefault((block.scale, cell.task, cell.method), []).append(cell.seed)
+    assert all(len(set(found)) == len(found) for found in seeds.values())
+    main = ("mlp", "pidm_random", "pidm_pretrained")
+    controls = ("pidm_random_orthogonal", "pidm_pretrained_orthogonal", "pidm_shuffled")
+    ablations = ("pidm_actor", "pidm_critic", "pidm_7k", "pidm_70k", "pidm_700k")
+    wanted = {("batch", "go1_loco", method): 5 for method in main}
+    wanted |= {("batch", "go1_loco", method): 3 for method in controls}
+    wanted |= {("batch", "go1_loco", f"{method}_unscaled"): 2 for method in main[1:]}
+    wanted |= {("batch", "anymal_loco", method): 3 for method in main}
+    wanted |= {("batch", "anymal_loco", method): 1 for method in controls}
+    walks = [(scale, task) for scale in ("1024", "256") for task in ("go1_loco", "anymal_loco")]
+    wanted |= {(*walk, method): 2 for walk in walks for method in main[1:]}
+    wanted |= {("batch", task, method): 3 for task in ("g1_loco", "anymal_pedipulation", *SKILLS) for method in main}
+    wanted |= {("batch", task, method): 2 for task in ("anymal_climb_up", "anymal_climb_down") for method in ablations}
+    wanted |= {("batch", task, "pidm_random_orthogonal"): 1 for task in SKILLS}
+    assert {cell: len(found) for cell, found in seeds.items()} == wanted
+    order = [cell for cells in study.planned(study.Args(tasks=SKILLS)).values() for cell in cells]
+    assert [cell.seed for cell in order[:30]] == [0] * 15 + [1] * 15, "the first seed of all skills before any second"
+
+
+@pytest.mark.parametrize(("scale", "envs_and_steps"), [("batch", (4096, 24, 14e6)), ("1024", (1024, 24, 10e6))])
+def test_walking_at_each_batch(scale, envs_and_steps):
+    """There are more than a hundred rows, so that 90% is read off to a hundredth of a run."""
+    for task in ("go1_loco", "anymal_loco"):
+        args = parsed(task, "pidm_random", scale)
+        assert (args.num_envs, args.num_steps, args.total_steps) == envs_and_steps
+        assert args.total_steps / (args.log_every * args.num_envs * args.num_steps) > 100
+
+
+def test_main_arms_start_with_small_actions_and_recorded_ones_did_not():
+    assert parsed("go1_loco", "pidm_random", "cpu").weight_init == "pytorch_unscaled"
+    for task, (_, config) in envs.TASKS.items():
+        for method in ("mlp", "pidm_random", "pidm_pretrained"):
+            assert parsed(task, method, "batch").weight_init == "pytorch", config.robot
+    for method in ("pidm_random", "pidm_pretrained"):
+        scaled, unscaled = (parsed("go1_loco", name, "batch") for name in (method, f"{method}_unscaled"))
+        assert dataclasses.replace(unscaled, weight_init="pytorch", run_dir=scaled.run_dir) == scaled
 
 
 def test_scripts_are_stopped_and_failures_reported(tmp_path):
@@ -96,30 +153,34 @@ def test_a_policy_is_evaluated_and_its_small_files_kept(tmp_path, monkeypatch):
 def test_study_and_report_share_one_table():
     assert study.METHODS is report.METHODS is grid.METHODS and study.TASKS is report.TASKS is grid.TASKS
     assert grid.TASKS.keys() == envs.TASKS.keys()
-    used = {name for task in grid.TASKS.values() for name in task.methods}
-    assert used == grid.METHODS.keys(), "every method has a task, and every task's methods exist"
+    planned = {name for block in grid.PLAN for name in block.methods}
+    recorded = {path.name for path in (report.STUDY / "cpu").glob("*/*")}
+    assert planned | recorded <= grid.METHODS.keys()
+    assert {block.scale for block in grid.PLAN} <= grid.SCALES.keys()
 
 
-def parsed(task, method):
+def parsed(task, method, scale):
     """Arguments of ppo_finetune.py for a run of the study, as its command line gives them."""
-    words = study.Cell("cpu", task, method, 0).words()
+    words = study.Cell(scale, task, method, 0).words()
     return ppo_finetune.merge(tyro.cli(ppo_finetune.Args, args=words), envs.TASKS[task][1].ppo)
 
 
-@pytest.mark.parametrize(("task", "method"), [(task, m) for task, row in grid.TASKS.items() for m in row.methods])
+RECORDED = sorted(path.parts[-3:-1] for path in (report.STUDY / "cpu").glob("*/*/seed0"))
+
+
+@pytest.mark.parametrize(("task", "method"), RECORDED)
 def test_flags_give_the_arguments_of_recorded_runs(task, method, tmp_path, monkeypatch):
-    """Flags parse. If the run is recorded, a new one has its arguments, under their new names, and its task.
+    """A run made today has the arguments of the recorded one, under their new names, and its task.
 
     Catches a change of a task that its recorded runs do not have, and that the page of results does not tell.
     """
     monkeypatch.setattr(study, "ROOT", tmp_path)
-    args = parsed(task, method)
+    args = parsed(task, method, "cpu")
     path = report.STUDY / "cpu" / task / method / "seed0/args.json"
-    if not path.exists():
-        return
     record, today = json.loads(path.read_text()), json.loads(json.dumps(dataclasses.asdict(args)))
-    record = {"load_into": record.get("init"), "weight_init": record.get("fresh", "orthogonal")} | record  # old names
-    shared = today.keys() & record.keys() - FREE
+    weights = {"pytorch": "pytorch_unscaled"}.get(record.get("fresh"), "orthogonal")
+    record = {"load_into": record.get("init"), "weight_init": weights} | record  # old names
+    shared = today.keys() & record.keys() - FREE - (WIDTHS if task in SKILLS else set())
     assert {name: today[name] for name in shared} == {name: record[name] for name in shared} and len(shared) > 24
     config = json.loads(json.dumps(dataclasses.asdict(envs.TASKS[task][1])))
     assert (grid.task_of(config) == grid.task_of(record["config"])) == (task not in CHANGED)
@@ -146,7 +207,8 @@ def test_runs_of_one_task_are_equal_whatever_their_age():
 
 def test_pretrained_weights_exist():
     """Those of parts of the data are made by pidm.py --stages sizes."""
-    for task, row in grid.TASKS.items():
-        for method in row.methods:
-            if grid.METHODS[method].group != "sizes" and (path := parsed(task, method).pretrained):
+    for block, cells in study.planned(study.Args(scales=tuple(grid.SCALES))).items():
+        for cell in cells:
+            path = parsed(cell.task, cell.method, block.scale).pretrained
+            if path and grid.METHODS[cell.method].group != "sizes":
                 assert (study.ROOT / path).exists()
