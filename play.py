@@ -235,7 +235,7 @@ def export_onnx(args):
         "torque_limit": env.model.actuator_forcerange[:, 1].tolist(),  # [N m] of the kp part
         "history": env.config.history,
         "prop": list(env.prop_layout),
-        **({"gait_hz": env.config.gait_hz} if "phase" in shapes else {}),  # of the input `phase`
+        **({name: getattr(env.config, name) for name in ("gait_hz", "march")} if "phase" in shapes else {}),
         "versions": records.versions(),
     }
     onnx.helper.set_model_props(model, {name: json.dumps(value) for name, value in facts.items()})

@@ -4,6 +4,7 @@ import dataclasses
 import io
 import re
 import sys
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -20,7 +21,7 @@ from envs.base import PROP, Env
 from envs.config import fits, parse
 from envs.engine import ENGINES, make_engine
 from envs.robots import ROBOTS
-from tools import play_onnx
+from tools import play_onnx, sim_to_sim
 
 TASKS = list(envs.TASKS)
 LOCOMOTION = ["anymal_loco", "go1_loco", "g1_loco"]  # one a robot; parkour has tests of its own
@@ -364,6 +365,26 @@ def test_feet_of_the_gait_are_half_a_step_apart(paced, task, pairs):
         stance, height = env.gait(jnp.array(still), 3)
         assert np.all(np.asarray(stance)) and not np.any(np.asarray(height))
     assert not np.all(np.asarray(env.gait(jnp.array([0.0, 0.0, 0.5]), 3)[0])), "turning on the spot takes steps"
+
+
+def test_a_marching_robot_steps_at_rest(jitted):
+    """Told to stand it has the steps, the phase and the prices of walking, with JAX and without."""
+    march, walk = (jitted("g1_loco", noise=0.0, march=march).env for march in (True, False))
+    rest, ahead, clock = jnp.zeros(3), jnp.array([0.5, 0.0, 0.0]), jnp.arange(25)
+    steps = [jax.vmap(partial(env.gait, command))(clock) for env, command in ((march, rest), (walk, ahead))]
+    jax.tree.map(np.testing.assert_array_equal, *steps)
+    state = jax.jit(march.reset)(jax.random.key(0))
+    task, motion = march.set_command(state.task, rest), march.motion(state.physics)
+    facts = {"gait_hz": march.config.gait_hz, "march": True}
+    data = SimpleNamespace(qpos=np.eye(1, 36, 3)[0], qvel=np.zeros(35))
+    robot = SimpleNamespace(data=data, facts=facts, seconds=3 * march.dt)
+    phase = march.task_inputs(task, motion, 3)["phase"]
+    np.testing.assert_allclose(phase, play_onnx.Player.readings(robot, np.zeros(3))["phase"], atol=1e-6)
+    np.testing.assert_allclose(phase, sim_to_sim.phase_of(facts, np.zeros((1, 3)), 3 * march.dt)[0], atol=1e-6)
+    assert np.linalg.norm(phase) == pytest.approx(1)
+    action = jnp.zeros(march.action_dim)
+    prices = march.rewards(task, motion.replace(foot_contact=jnp.zeros(2, bool)), action, action, 3)
+    assert prices["stand_still"] == 0 == prices["stand_on_feet"]
 
 
 def test_phase_is_the_clock_of_the_next_reward(paced):

@@ -100,7 +100,7 @@ class Player:
         """Inputs of the policy by name, in SI units and the base frame."""
         d, turn = self.data, np.zeros(9)
         angle = 2 * np.pi * self.facts.get("gait_hz", 0.0) * self.seconds
-        moves = np.hypot(*command[:2]) > 0.1 or abs(command[2]) > 0.1
+        moves = self.facts.get("march", False) or np.hypot(*command[:2]) > 0.1 or abs(command[2]) > 0.1
         mujoco.mju_quat2Mat(turn, d.qpos[3:7])
         down = turn.reshape(3, 3).T
         return {

@@ -396,9 +396,9 @@ def check_policy(path, facts, shapes):
 
 
 def phase_of(facts, command, seconds):
-    """Sine and cosine (N, 2) of the gait's clock at a time since the start, 0 where the command (N, 3) is 0."""
+    """Sine and cosine (N, 2) of the gait's clock at a time since the start, 0 where it rests; command (N, 3)."""
     angle = 2 * np.pi * facts.get("gait_hz", 0.0) * seconds
-    return np.array([np.sin(angle), np.cos(angle)]) * command.any(-1, keepdims=True)
+    return np.array([np.sin(angle), np.cos(angle)]) * (command.any(-1, keepdims=True) | facts.get("march", False))
 
 
 # --- Driving ---
