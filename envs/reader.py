@@ -4,6 +4,7 @@ loader.py makes a robot to train of it, and tools/sim_to_sim.py drives a policy 
 line.
 """
 
+import os
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
@@ -23,7 +24,7 @@ def read(path):
     except (ET.ParseError, LookupError, ValueError) as error:  # the last two: of unknown encodings
         raise ValueError(f"{path} is not an XML file: {one_line(error)}") from None
     try:
-        spec = mujoco.MjSpec.from_file(str(path))
+        spec = mujoco.MjSpec.from_file(os.fsencode(path).decode())  # MuJoCo wants UTF-8, whatever the locale
     except (ValueError, mujoco.FatalError) as error:
         raise ValueError(f"MuJoCo cannot read {path}: {one_line(error)}") from None
     if tag == "robot":

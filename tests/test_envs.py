@@ -583,7 +583,7 @@ def test_the_documented_robust_sets_are_those_of_the_configs():
     for i, task in enumerate(LOCOMOTION):
         usual = envs.TASKS[task][1]
         config = envs.replace_checked(usual, usual.robust)
-        assert usual.robust.keys() - {"weights", "gait_hz", "stance", "swing_height"} <= rows.keys()
+        assert usual.robust.keys() - {"weights", "gait_hz", "stance", "swing_height", "march"} <= rows.keys()
         for name, row in rows.items():
             numbers = [float(word) for word in row.split(" | ")[i].split(" to ")]
             assert numbers == np.ravel(getattr(config, name)).tolist(), (task, name)

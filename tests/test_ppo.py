@@ -20,6 +20,7 @@ ARGS = script.Args(
     gae_lambda=0.8,
     entropy_coef=0.01,
     mirror_coef=0.1,
+    desired_kl=0.01,
 )
 
 

@@ -145,6 +145,7 @@ def test_a_checkout_with_letters_beyond_ascii_has_a_commit(tmp_path):
     """In a process of its own, whose locale does not know them."""
     shutil.copytree(ROOT / "experiment", tmp_path / "ü/experiment")
     shutil.copytree(ROOT / "envs", tmp_path / "ü/envs", ignore=shutil.ignore_patterns("*.obj", "*.stl", "*.png"))
+    shutil.copytree(ROOT / "assets", tmp_path / "ü/assets", ignore=shutil.ignore_patterns("pidm"))
     for words in (["init"], ["-c", "user.name=a", "-c", "user.email=a@b.c", "commit", "--allow-empty", "-m", "x"]):
         subprocess.run(["git", "-C", tmp_path / "ü", *words], check=True, capture_output=True)
     environ = os.environ | {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}

@@ -169,7 +169,10 @@ FAULTS = {  # (file, tests, words for -k) -> faults: name, old text, new text
         ("a clock that asks who stands for steps", "(share >= swing) | ~moves", "(share >= swing)"),
     ],
     ("envs/locomotion.py", "test_envs", "next_reward"): [
-        ("a phase while standing", "jnp.cos(angle)]) * rewards.moving(task.command)", "jnp.cos(angle)])"),
+        ("a phase while standing", "jnp.cos(angle)]) * self.paced(task.command)", "jnp.cos(angle)])"),
+    ],
+    ("envs/locomotion.py", "test_envs", "marching"): [
+        ("a robot that never marches", "rewards.moving(command) | self.config.march", "rewards.moving(command)"),
     ],
     ("envs/rewards.py", "test_envs", "half_a_step_apart and g1"): [
         ("turning on the spot is standing", " | (jnp.abs(command[2]) > 0.1)", ""),
@@ -221,7 +224,7 @@ FAULTS = {  # (file, tests, words for -k) -> faults: name, old text, new text
         ("any text turns --robust on", "if not isinstance(robust, bool):", "if False:"),
     ],
     ("ppo_finetune.py", "test_scripts", "set_reaches"): [
-        ("--robust is not heard", "partial(envs.make, robust=args.robust)", "envs.make"),
+        ("--robust is not heard", "robust=args.robust, robot", "robot"),
     ],
     ("play.py", "test_scripts", "set_reaches"): [
         ("a policy forgets its robust set", 'meta["args"].get("robust", False)', "False"),
