@@ -203,7 +203,6 @@ class G1Locomotion(Locomotion):
             "hip_deviation": jnp.sum(jnp.abs(m.joint_pos[self.hips])),
             "arm_deviation": jnp.sum(jnp.abs(m.joint_pos[self.arms])),
             "waist_deviation": jnp.sum(jnp.abs(m.joint_pos[self.waist])),
-            "feet_too_near": rewards.too_near(m.foot_pos, 0.18),  # its legs pass through each other, a robot's do not
         }
 
     def tracked_velocity(self, motion):
@@ -361,7 +360,7 @@ G1_LOCO = LocomotionConfig(
         "joint_friction": (0.0, 0.3),
         "lin_vel_x": (-0.8, 1.2),
         "march": True,  # on two feet at rest it fell slowly, for its actions are late
-        "weights": G1_WEIGHTS | {"track_lin_vel": 5.0, "slip": -0.5, "joint_limits": -5.0, "feet_too_near": -10.0},
+        "weights": G1_WEIGHTS | {"track_lin_vel": 5.0, "slip": -0.5, "joint_limits": -5.0},
     },
     weights=G1_WEIGHTS,
     ppo={

@@ -61,11 +61,6 @@ def slip(foot_vel, contact):
     return jnp.sum(jnp.linalg.norm(foot_vel[:, :2], axis=-1) * contact)
 
 
-def too_near(foot_pos, distance):
-    """How much nearer than `distance` a biped's feet are to each other, seen from above; (2, 3) [m], [m]."""
-    return jnp.maximum(distance - jnp.linalg.norm(foot_pos[0, :2] - foot_pos[1, :2]), 0.0)
-
-
 def touching(force):
     """Number of bodies with a contact force above 1 N; force (B, 3)."""
     return jnp.sum(jnp.linalg.norm(force, axis=-1) > 1.0)

@@ -16,7 +16,6 @@ import pytest
 from test_weights import LIMITS, WEIGHTS
 
 import envs
-from envs import rewards
 
 DT, SUBSTEPS = 0.02, 4  # control step [s], physics steps in it
 ROBOTS, STEPS = 8, 45
@@ -340,13 +339,6 @@ def test_terms_and_rewards_over_a_rollout(jitted, name):
                 resets += 1
     assert seen == weights.keys(), f"never nonzero: {weights.keys() - seen}"
     assert resets >= 2
-
-
-def test_feet_too_near():
-    """Faults: the height of a foot counts, feet that are far apart are paid for."""
-    feet = jnp.array([[1.0, 2.0, 0.0], [1.03, 2.04, 0.3]])
-    assert rewards.too_near(feet, 0.18) == pytest.approx(0.13)
-    assert rewards.too_near(feet, 0.04) == 0
 
 
 def test_every_kind_of_task_has_a_case():
