@@ -279,6 +279,18 @@ def test_a_film_of_parkour_shows_title_goal_and_end(jitted, monkeypatch):
     assert model.camera("track").fovy[0] < render.build(env, state.physics).compile().camera("track").fovy[0]
 
 
+def test_a_film_ends_with_its_episode(jitted):
+    """Legs that give way end it at once. The pose stays that of the fall, whatever the next episodes do."""
+    env = jitted("go1_loco", noise=0.0, episode_seconds=2.0).env
+    flat = 40.0 * jnp.tile(jnp.array([0.0, 1.0, 1.0]), 4)
+    net = SimpleNamespace(inputs=lambda obs, _: obs, apply=lambda _, obs, method: jnp.tile(flat, (len(obs), 1)), mean=0)
+    result, start, qpos = jax.jit(lambda: play.evaluate(env, net, None, 2))()
+    fall = round(float(result["episode_seconds"]) / env.dt)
+    assert result["falls"] == 1 and 3 < fall < len(qpos) / 2
+    last = np.flatnonzero(np.any(np.diff(qpos, axis=0), axis=1)).max() + 1
+    assert 3 < last < len(qpos) / 2 and qpos[-1, 2] < start.physics.qpos[2] - 0.03
+
+
 def test_markers_are_what_the_robot_is_told_to_reach(jitted):
     """Pedipulation's is the commanded point, which the showcase holds fixed; a walker has none."""
     env = jitted("anymal_pedipulation", **envs.TASKS["anymal_pedipulation"][0].SHOWCASE_FIELDS).env
