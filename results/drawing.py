@@ -8,7 +8,7 @@ import numpy as np
 
 from experiment import figures
 from results import measures
-from results.grid import METHODS, TABLE_1, TASKS
+from results.grid import ANYMAL, GO1, METHODS, TABLE_1, TASKS
 
 MODULES = ("intention_encoder", "history_encoder", "backbone", "action_synthesizer")  # of the actor
 COLOURS = {  # of a method; dashed if only its initial weights differ
@@ -74,7 +74,7 @@ def draw_task(ax, task, runs, methods, extra=None):
         ax.plot(*extra[1:], color="black", label=extra[0])
     parkour = "progress" in first["columns"]
     seeds_of = measures.seeds(runs, [method for method in methods if method in runs])
-    ax.set(title=f"{TASKS[task].title} (n = {seeds_of})", xlabel="PPO iteration", ylim=(0, None))
+    ax.set(title=f"{TASKS[task]} (n = {seeds_of})", xlabel="PPO iteration", ylim=(0, None))
     ax.set_ylabel("curriculum progress" if parkour else "episode return")
     per_iteration = first["columns"]["env_steps"][-1] / first["iteration"][-1] / 1e6
     above = ax.secondary_xaxis("top", functions=(lambda x: x * per_iteration, lambda x: x / per_iteration))
@@ -136,7 +136,7 @@ def draw_updates(study, path, task="anymal_pedipulation"):
     axes[0, 0].set_ylabel("mean |change| of a weight\nper iteration")
     axes[1, 0].set_ylabel("the same over\nthe step size")
     fig.suptitle(
-        f"{TASKS[task].title}: updates of the actor (n = {measures.seeds(runs, ('pidm_random', 'pidm_pretrained'))})"
+        f"{TASKS[task]}: updates of the actor (n = {measures.seeds(runs, ('pidm_random', 'pidm_pretrained'))})"
     )
     legend_below(fig, axes.ravel(), SHADE)
     figures.save(fig, path, dpi=80)
@@ -169,7 +169,7 @@ def draw_success(study, path):
         labels = [f"{METHODS[m].title} (n = {len(study[task][m])})" for m in methods]
         ax.set_yticks(range(len(methods)), labels, fontsize=9)
         ax.set_xticks(range(table.shape[1]), range(table.shape[1]), fontsize=8)
-        ax.set_title(TASKS[task].title, fontsize=10, loc="left")
+        ax.set_title(TASKS[task], fontsize=10, loc="left")
     axes[-1, 0].set_xlabel("level of the course: 0 easiest, 9 hardest")
     fig.colorbar(image, ax=axes, label="episodes of the mean action that succeed [%]", shrink=0.5, aspect=30)
     figures.save(fig, path, dpi=90)
@@ -188,12 +188,45 @@ def draw_sizes(study, path, errors):
         known = {count: measures.compare(task, runs, method, "to 90%") for count, method in methods.items()}
         known = {count: found.value for count, found in known.items() if found is not None}
         if len(known) > 1:
-            right.semilogx(list(known), list(known.values()), "os^Dv"[k % 5] + "-", label=TASKS[task].title)
+            right.semilogx(list(known), list(known.values()), "os^Dv"[k % 5] + "-", label=TASKS[task])
     right.set(xlabel="transitions", ylabel="iterations to 90%, against random [%]")
     right.axhline(0.0, color="0.6", lw=1)
     for ax in (left, right):
         ax.grid(alpha=0.3)
     if right.get_legend_handles_labels()[0]:
         right.legend(fontsize=8)
+    figures.save(fig, path, dpi=80)
+    return True
+
+
+def by_batch(loaded, task):
+    """Runs of a task by number of environments, of the scales that have both PIDMs; the later of two with as many."""
+    studies = [
+        study[task] for study in loaded.values() if {"pidm_random", "pidm_pretrained"} <= study.get(task, {}).keys()
+    ]
+    return {runs["pidm_random"][0]["settings"]["num_envs"]: runs for runs in studies}
+
+
+def draw_batch(loaded, path):
+    """What pretraining brings over the number of environments (scale -> task -> runs), on the walking quadrupeds."""
+    found = {task: by_batch(loaded, task) for task in GO1 + ANYMAL}
+    if max(map(len, found.values())) < 2:
+        return False
+    fig, (axes,) = panels(1, 3, 3.6)
+    for ax, name in zip(axes, ("final", "area", "to 90%"), strict=True):
+        for (task, runs), marker in zip(found.items(), "os", strict=True):
+            estimates = {n: measures.compare(task, runs[n], "pidm_pretrained", name) for n in sorted(runs)}
+            values = [one.value for one in estimates.values()]
+            (line,) = ax.semilogx([*estimates], values, f"{marker}-", label=TASKS[task])
+            ends = [(n, *one.interval) for n, one in estimates.items() if one.interval]
+            ax.vlines(*np.reshape(ends, (-1, 3)).T, color=line.get_color(), lw=1)
+        ax.axhline(0.0, color="0.6", lw=1)
+        counts = sorted({n for runs in found.values() for n in runs})
+        ax.set_xticks(counts, counts)
+        ax.minorticks_off()
+        ax.set(xlabel="environments", title=measures.MEASURES[name].title)
+        ax.grid(alpha=0.3)
+    axes[0].set_ylabel("pretrained against random [%]")
+    legend_below(fig, axes, "vertical lines: 95% intervals over seeds (none where there is one)")
     figures.save(fig, path, dpi=80)
     return True

@@ -13,13 +13,6 @@ UNSCALED = "--weight-init pytorch_unscaled"
 
 
 @dataclass(frozen=True)
-class Task:
-    """A task of the paper."""
-
-    title: str  # in tables and figures
-
-
-@dataclass(frozen=True)
 class Method:
     """A way to start a training."""
 
@@ -48,16 +41,16 @@ class Block:
     seeds: range
 
 
-TASKS = {  # in the paper's order
-    "anymal_loco": Task("ANYmal D locomotion"),
-    "anymal_pedipulation": Task("Pedipulation"),
-    "anymal_parkour_walk": Task("Parkour walk"),
-    "anymal_climb_up": Task("Climb up"),
-    "anymal_climb_down": Task("Climb down"),
-    "anymal_crouch": Task("Crouch"),
-    "anymal_jump": Task("Jump"),
-    "go1_loco": Task("Go1 locomotion"),
-    "g1_loco": Task("G1 locomotion"),
+TASKS = {  # their titles in tables and figures, in the paper's order
+    "anymal_loco": "ANYmal D locomotion",
+    "anymal_pedipulation": "Pedipulation",
+    "anymal_parkour_walk": "Parkour walk",
+    "anymal_climb_up": "Climb up",
+    "anymal_climb_down": "Climb down",
+    "anymal_crouch": "Crouch",
+    "anymal_jump": "Jump",
+    "go1_loco": "Go1 locomotion",
+    "g1_loco": "G1 locomotion",
 }
 
 METHODS = {

@@ -26,7 +26,7 @@ sys.path.insert(0, str(ROOT))
 
 from experiment import figures, records
 from results import drawing, measures
-from results.grid import METHODS, TASKS, task_of, titles
+from results.grid import METHODS, SCALES, TABLE_1, TASKS, task_of, titles
 from results.measures import MEASURES
 
 STUDY = ROOT / "results/study"
@@ -156,6 +156,12 @@ def paper_mean(method, name, tasks):
     return f"{np.mean([known[task] for task in tasks]):+.1f}" if known and tasks else ""
 
 
+def batch(runs):
+    """Environments x steps of a rollout of a task's runs as text, empty if there are none."""
+    settings = next((arm[0]["settings"] for arm in runs.values()), None)
+    return "{num_envs} x {num_steps}".format(**settings) if settings else ""
+
+
 def columns_of(names):
     """Title, method and measure of the columns that compare the MLP and the pretrained PIDM in these measures."""
     methods = {"mlp": "MLP", "pidm_pretrained": "pretrained"}
@@ -168,7 +174,7 @@ def table_1(study, tasks=tuple(TASKS)):
     rows = []
     for task in tasks:
         runs = study.get(task, {})
-        row = {"task": TASKS[task].title, "seeds": measures.seeds(runs, ("mlp", "pidm_random", "pidm_pretrained"))}
+        row = {"task": TASKS[task], "batch": batch(runs), "seeds": measures.seeds(runs, TABLE_1)}
         for i, (head, method, name) in enumerate(columns):
             found = measures.compare(task, runs, method, name)
             row |= {head: shown(found), "paper" + " " * i: paper(method, name, task)}
@@ -178,7 +184,7 @@ def table_1(study, tasks=tuple(TASKS)):
         "several seeds": (measures.several, measures.mean_over_seeds),
     }
     for title, (chosen, mean) in means.items():
-        row = {"task": f"mean, {title}", "seeds": ""}
+        row = {"task": f"mean, {title}", "batch": "", "seeds": ""}
         for i, (head, method, name) in enumerate(columns):
             row |= {head: shown(mean(study, method, name))}
             row |= {"paper" + " " * i: paper_mean(method, name, chosen(study, method))}
@@ -207,7 +213,7 @@ def along_the_way(study):
     for task, runs in study.items():
         if "pidm_random" not in runs:
             continue
-        row = {"task": TASKS[task].title}
+        row = {"task": TASKS[task]}
         row |= {head: shown(measures.compare(task, runs, method, name)) for head, method, name in columns}
         for title, name in (("better at the end", "final"), ("sooner at 90%", "to 90%")):
             row[f"pretrained {title}, of seeds"] = wins(runs, "pidm_pretrained", name)
@@ -234,7 +240,7 @@ def ablation(study, methods, tasks):
             for j, name in enumerate(("final", "to 90%")):
                 what = "final" if name == "final" else "iterations"
                 found = measures.compare(task, study.get(task, {}), method, name)
-                row[f"{TASKS[task].title}: {what} [%]"] = shown(found)
+                row[f"{TASKS[task]}: {what} [%]"] = shown(found)
                 row["paper" + " " * (2 * i + j)] = paper(method, name, task)
         rows.append(row)
     return markdown(without_empty(rows))
@@ -247,7 +253,7 @@ def controls(study):
         for method, against in CONTROLS:
             arms = measures.same_seeds(runs, method, against)
             if arms and {"pidm_shuffled", "pidm_random_orthogonal"} & runs.keys():
-                row = {"task": TASKS[task].title, "method": METHODS[method].title, "against": METHODS[against].title}
+                row = {"task": TASKS[task], "method": METHODS[method].title, "against": METHODS[against].title}
                 row["seeds"] = ", ".join(str(run["seed"]) for run in arms[method])
                 for name, title in {"final": "final", "area": "mean of training", "to 90%": "iterations"}.items():
                     row[f"{title} [%]"] = shown(measures.compare(task, arms, method, name, against))
@@ -266,7 +272,7 @@ def updates_table(study):
             for name in ("lr", *(f"update/actor/{module}" for module in drawing.MODULES))
         }
         step = ratio.pop("lr")
-        row = {"task": TASKS[task].title, "seeds": measures.seeds(runs, ("pidm_pretrained", "pidm_random"))}
+        row = {"task": TASKS[task], "seeds": measures.seeds(runs, ("pidm_pretrained", "pidm_random"))}
         row |= {name.split("/")[-1].replace("_", " "): f"{100 * (x - 1):+.0f}" for name, x in ratio.items()}
         row |= {"step size": f"{100 * (step - 1):+.0f}"}
         row |= {"backbone per step size": f"{100 * (ratio['update/actor/backbone'] / step - 1):+.0f}"}
@@ -281,7 +287,7 @@ def progress_table(study):
         goal = measures.goal_of(runs["pidm_random"]) if "pidm_random" in runs else None
         for method, mine in runs.items():
             each = {name: measures.values(name, mine, goal) for name in ("final", "area")}
-            row = {"task": TASKS[task].title, "method": METHODS[method].title}
+            row = {"task": TASKS[task], "method": METHODS[method].title}
             row["seeds"] = ", ".join(str(run["seed"]) for run in mine)
             row["final"] = spread(each["final"])
             row["of it in the last third [%]"] = f"{100 * np.mean([measures.late_gain(run) for run in mine]):.0f}"
@@ -307,7 +313,7 @@ def actions_table(study):
     )
     for task, runs in chosen.items():
         for method, mine in runs.items():
-            row = {"task": TASKS[task].title, "method": METHODS[method].title, "seeds": str(len(mine))}
+            row = {"task": TASKS[task], "method": METHODS[method].title, "seeds": str(len(mine))}
             for name in names:
                 known = [run["errors"][name] for run in mine if name in run["errors"]]
                 row[name.replace("_", " ")] = f"{np.mean(known):.3g}" if known else ""
@@ -315,14 +321,14 @@ def actions_table(study):
     return markdown(rows)
 
 
-def scales(study):
+def sizes_and_machines(study):
     """Lines that say how large the runs of each task are, and on what they were made."""
     lines = []
     for task, runs in study.items():
         one = next(iter(runs.values()))[0]
         s, v = one["settings"], one["versions"]
-        size = f"{s['num_envs']} x {s['num_steps']}, {s['total_steps'] / 1e6:.1f} M steps"
-        lines.append(f"- {TASKS[task].title}: `{task}`, {size}, {v['device']}, {v['machine']}")
+        size = f"{batch(runs)}, {s['total_steps'] / 1e6:.1f} M steps"
+        lines.append(f"- {TASKS[task]}: `{task}`, {size}, {v['device']}, {v['machine']}")
     return lines
 
 
@@ -366,21 +372,29 @@ def sizes_of(robot):
 DETAILS = """# Every run of the study
 
 Written by `python results/report.py`; [Results](../README.md) says what these tables mean. A folder has the arguments,
-rows and evaluation of one run: `cpu/<task>/<method>/seed<k>`. Figures after ± are standard deviations over seeds (ddof
-1). The scale is environments x steps of a rollout.
-"""
-ACTIONS = """## What the mean action does at the end
-
-Without exploration noise, 64 episodes a seed: return, length [s], share of falls, errors of the velocity [m/s], of the
-yaw rate [rad/s] and of the foot [m].
+rows and evaluation of one run: `<scale>/<task>/<method>/seed<k>`. Figures after ± are standard deviations over seeds
+(ddof 1). [grid.py](../grid.py) has the scales. Of each, the first table is of the training, the second of the mean
+action at its end: without exploration noise, 64 episodes a seed, return, length [s], share of falls, errors of the
+velocity [m/s], of the yaw rate [rad/s] and of the foot [m].
 """
 MARKED = re.compile(r"(<!-- results/report\.py writes ?([\w -]*?) ?from here -->\n).*?(<!-- to here -->)", re.S)
 
 
-def load_study(scale):
-    """Runs of each task that has any, in the paper's order."""
-    loaded = {task: load_task(STUDY / scale / task) for task in TASKS}
-    return {task: runs for task, runs in loaded.items() if runs}
+def load_study():
+    """Runs of each scale and task that has any: scale -> task -> method -> runs."""
+    loaded = {scale: {task: load_task(STUDY / scale / task) for task in TASKS} for scale in SCALES}
+    found = {scale: {task: runs for task, runs in study.items() if runs} for scale, study in loaded.items()}
+    return {scale: study for scale, study in found.items() if study}
+
+
+def pick(loaded, methods=TABLE_1):
+    """Runs of each task at the scale that has most of these methods, the later of grid.py if several have."""
+    chosen = {}
+    for task in TASKS:
+        studies = [study[task] for study in reversed(loaded.values()) if task in study]
+        if studies:
+            chosen[task] = max(studies, key=lambda runs: len({*methods} & runs.keys()))
+    return chosen
 
 
 def readme_table(study):
@@ -400,18 +414,19 @@ def sizes(study, methods, tasks):
     return [*lines, "", f"Error by number of transitions: {line}.", "", "![sizes](study/sizes.png)"]
 
 
-def blocks(study):
+def blocks(loaded):
     """Lines of each marked place, by its name; the unnamed one is in the project's README."""
+    study = pick(loaded)
     climbing = ("anymal_climb_up", "anymal_climb_down")
-    loaded = {"pidm_pretrained": METHODS["pidm_pretrained"].title}
+    main = {"pidm_pretrained": METHODS["pidm_pretrained"].title}
     return {
         "": readme_table(study),
         "table 1": table_1(study),
         "all tasks": overall(study),
         "along the way": along_the_way(study),
-        "table 2": ablation(study, titles("table 2") | loaded, climbing),
-        "sizes": sizes(study, titles("sizes") | loaded, climbing),
-        "controls": controls(study),
+        "table 2": ablation(pick(loaded, titles("table 2")), titles("table 2") | main, climbing),
+        "sizes": sizes(pick(loaded, titles("sizes")), titles("sizes") | main, climbing),
+        "controls": controls(pick(loaded, sum(CONTROLS, ()))),
         "updates": updates_table(study),
         "accuracy": pidm_table(),
     }
@@ -422,39 +437,49 @@ def filled(text, lines):
     return MARKED.sub(lambda mark: "\n".join([mark[1], *lines[mark[2]], "", mark[3]]), text)
 
 
-def details(study):
+def details(loaded):
     """Text of results/study/README.md."""
-    parts = [DETAILS, *scales(study), "", *progress_table(study), "", ACTIONS, *actions_table(study)]
+    parts = [DETAILS]
+    for scale, study in loaded.items():
+        tables = *progress_table(study), "", *actions_table(study)
+        parts += [f"## {scale}", "", *sizes_and_machines(study), "", *tables, ""]
     return "\n".join(parts).rstrip() + "\n"
 
 
-def draw_all(study):
+def draw_all(loaded):
     """Draw the figures that the runs allow, and remove those that they no longer allow."""
+    study = pick(loaded)
     drawing.draw_curves(study, STUDY / "curves.png")
     drawn = {
-        "controls.png": drawing.draw_controls,
-        "updates.png": drawing.draw_updates,
-        "success.png": drawing.draw_success,
-        "sizes.png": lambda study, path: drawing.draw_sizes(study, path, sizes_of("anymal_d")),
+        "controls.png": lambda path: drawing.draw_controls(pick(loaded, sum(CONTROLS, ())), path),
+        "updates.png": lambda path: drawing.draw_updates(study, path),
+        "success.png": lambda path: drawing.draw_success(study, path),
+        "sizes.png": lambda path: drawing.draw_sizes(pick(loaded, titles("sizes")), path, sizes_of("anymal_d")),
+        "batch.png": lambda path: drawing.draw_batch(loaded, path),
     }
     for name, draw in drawn.items():
-        if not draw(study, STUDY / name):
+        if not draw(STUDY / name):
             (STUDY / name).unlink(missing_ok=True)
 
 
 def beside(folder):
-    """Draw a run with the recorded ones of its task, in its own folder. UserError if either is missing."""
+    """Draw a run with the recorded ones of its task, in its own folder. UserError if either is missing.
+
+    The recorded ones are those of the same number of environments, if there are any.
+    """
     try:
-        task = json.loads((folder / "args.json").read_text())["task"]
+        args = json.loads((folder / "args.json").read_text())
+        task = args["task"]
         with (folder / "metrics.csv").open() as file:
             rows = list(csv.DictReader(file))
         name = "progress" if "progress" in rows[0] else "episode_return"
         points = [(float(row["iteration"]), float(row[name])) for row in rows]
     except (OSError, ValueError, KeyError, IndexError) as error:
         raise records.UserError(f"{folder} is not a run of ppo_finetune.py: {error}") from None
-    runs = load_task(STUDY / "cpu" / task)
-    if not runs:
+    known = [study[task] for study in load_study().values() if task in study]
+    if not known:
         raise records.UserError(f"results/study has no runs of {task}")
+    runs = max(known, key=lambda runs: batch(runs) == "{num_envs} x {num_steps}".format(**args))
     path = folder / "beside_recorded.png"
     drawing.draw_curves({task: runs}, path, tuple(METHODS), ("this run", *zip(*points, strict=True)))
     print(f"wrote {path}")
@@ -486,12 +511,12 @@ def main(args):
         return beside(Path(args.beside))
     if args.live:
         return live(Path(args.live))
-    study = load_study("cpu")
-    if not study:
+    loaded = load_study()
+    if not loaded:
         raise records.UserError("results/study has no finished runs; run results/study.py")
-    lines = blocks(study)
+    lines = blocks(loaded)
     pages = {path: filled(path.read_text("utf-8"), lines) for path in (ROOT / "README.md", ROOT / "results/README.md")}
-    pages[STUDY / "README.md"] = details(study)
+    pages[STUDY / "README.md"] = details(loaded)
     if args.check:
         for path, text in pages.items():
             if not path.exists() or path.read_text("utf-8") != text:
@@ -499,8 +524,8 @@ def main(args):
         return None
     for path, text in pages.items():
         records.replace_text(path, text)
-    draw_all(study)
-    print("\n".join(table_1(study)))
+    draw_all(loaded)
+    print("\n".join(lines["table 1"]))
     return None
 
 

@@ -15,7 +15,8 @@ from tools import bench
 
 
 def curve(values, seed=0):
-    return {"iteration": np.arange(1.0, len(values) + 1), "indicator": np.asarray(values, float), "seed": seed}
+    rows = {"iteration": np.arange(1.0, len(values) + 1), "indicator": np.asarray(values, float)}
+    return rows | {"seed": seed, "settings": {"num_envs": 256, "num_steps": 24}}
 
 
 def flat(*levels):
@@ -164,8 +165,8 @@ def test_means_over_tasks():
     assert str(measures.mean_over_seeds(study, "mlp", "final")) == "-10.0"
     assert measures.mean_over_tasks(study, "mlp", "final").value == pytest.approx(870 / 3)
     every, several = (line.split(" | ") for line in report.table_1(study)[-2:])
-    assert every[2].startswith("+290.0 [") and every[3] == "-1.1"  # the paper: +0.6, -0.2 and -3.7
-    assert several[2:4] == ["-10.0", "+0.2"] and several[4:6] == ["not run", ""]
+    assert every[3].startswith("+290.0 [") and every[4] == "-1.1"  # the paper: +0.6, -0.2 and -3.7
+    assert several[3:5] == ["-10.0", "+0.2"] and several[5:7] == ["not run", ""]
 
 
 def test_mean_counts_a_run_that_never_got_there_by_its_length():
@@ -317,7 +318,7 @@ def test_report_writes_the_same_bytes_twice(tmp_path, monkeypatch):
     study = {"go1_loco": report.load_task(report.ROOT / "results/study/cpu/go1_loco")}
     images = []
     for _ in range(2):
-        report.draw_all(study)
+        report.draw_all({"cpu": study})
         images.append({path.name: path.read_bytes() for path in tmp_path.glob("*.png")})
     assert images[0] == images[1] and {*images[0]} == {"curves.png", "controls.png"}  # what one task of walking allows
 
@@ -327,10 +328,38 @@ def test_figures_of_parkour_and_updates_are_drawn(tmp_path, monkeypatch):
     monkeypatch.setattr(report, "STUDY", tmp_path)
     names = ("anymal_jump", "anymal_pedipulation")
     study = {name: report.load_task(report.ROOT / f"results/study/cpu/{name}") for name in names}
-    report.draw_all(study)
+    report.draw_all({"cpu": study})
     assert {path.name for path in tmp_path.glob("*.png")} == {"curves.png", "success.png", "updates.png"}
-    report.draw_all({"anymal_jump": study["anymal_jump"]})
+    report.draw_all({"cpu": {"anymal_jump": study["anymal_jump"]}})
     assert {path.name for path in tmp_path.glob("*.png")} == {"curves.png", "success.png"}
+
+
+def test_each_table_takes_the_scale_that_has_most_of_its_methods():
+    """A scale under way does not replace a complete one, and replaces it at once when it is as complete.
+
+    Catches runs of two scales in one row, and controls that vanish while Table I moves to another scale.
+    """
+    small = {method: flat(1.0) for method in (*report.TABLE_1, "pidm_shuffled")}
+    large = {method: flat(2.0) for method in report.TABLE_1[1:]}
+    loaded = {"cpu": {"go1_loco": small, "g1_loco": small}, "batch": {"go1_loco": large}}
+    assert report.pick(loaded) == {"go1_loco": small, "g1_loco": small}
+    large["mlp"] = flat(3.0)
+    assert report.pick(loaded)["go1_loco"] is large and report.pick(loaded)["g1_loco"] is small
+    assert report.pick(loaded, ("pidm_random", "pidm_shuffled"))["go1_loco"] is small
+
+
+def test_what_pretraining_brings_is_drawn_over_the_batch(tmp_path):
+    """Of two scales of 256 environments the later one counts; one batch alone is no figure."""
+
+    def arms(num_envs, *ends):
+        settings = {"settings": {"num_envs": num_envs}}
+        both = {"pidm_random": flat(10.0, 11.0), "pidm_pretrained": flat(*ends)}
+        return {"go1_loco": {method: [run | settings for run in runs] for method, runs in both.items()}}
+
+    loaded = {"cpu": arms(256, 9.0, 10.0), "256": arms(256, 10.0, 10.0), "batch": arms(4096, 12.0, 13.0)}
+    assert drawing.by_batch(loaded, "go1_loco") == {256: loaded["256"]["go1_loco"], 4096: loaded["batch"]["go1_loco"]}
+    assert drawing.draw_batch(loaded, tmp_path / "batch.png") and (tmp_path / "batch.png").stat().st_size > 5000
+    assert not drawing.draw_batch({"cpu": loaded["cpu"], "256": loaded["256"]}, tmp_path / "none.png")
 
 
 @pytest.fixture
