@@ -374,7 +374,8 @@ def test_weights_follow_the_body(bodies):
     weights = [envs.newcomers.loco(one).weights for one in (body, twice)]
     assert weights[0]["torque"] == pytest.approx(4 * weights[1]["torque"])
     assert weights[0]["pose"] == envs.locomotion.GO1_LOCO.weights["pose"]
-    assert envs.newcomers.loco(bodies["walker"]).gait_hz > 0 == envs.newcomers.loco(body).gait_hz
+    two_feet, four_feet = envs.newcomers.loco(bodies["walker"]), envs.newcomers.loco(body)
+    assert two_feet.gait_hz > 0 == four_feet.gait_hz and two_feet.march > four_feet.march
 
 
 def test_a_run_is_repeatable_without_its_file(write, tmp_path, refused):
