@@ -224,16 +224,12 @@ def test_demo_is_what_was_recorded():
 
 
 def test_main_use_is_what_was_recorded():
-    """Minutes and returns of G1 with a pretrained PIDM in the README are those of the study's runs at 8 M steps."""
-    minutes, returns = [], []
-    for path in (ROOT / "results/study/cpu/g1_loco/pidm_pretrained").glob("seed[012]/metrics.csv"):
-        with path.open() as file:
-            row = next(row for row in csv.DictReader(file) if float(row["env_steps"]) >= 8e6)
-        minutes.append(float(row["seconds"]) / 60)
-        returns.append(float(row["episode_return"]))
+    """Minutes, error and falls of G1 with a pretrained PIDM in the README are those of the study's run."""
+    run = "study/batch/g1_loco/pidm_pretrained/seed0"
+    row, result = last_row(ROOT / "results" / run), read(run, "eval.json")["task"]
     text = " ".join(README.split())
-    assert f"took {min(minutes):.0f} to {max(minutes):.0f} minutes" in text
-    assert f"returns were {min(returns):.0f} to {max(returns):.0f}" in text
+    assert f"run of {float(row['env_steps']) / 1e6:.0f} M took {float(row['seconds']) / 60:.0f} minutes" in text
+    assert f"velocity by {result['lin_vel_error']:.2f} m/s and fell in {100 * result['falls']:.0f}% of" in text
 
 
 @pytest.mark.parametrize("robot", ["anymal_d", "go1"])

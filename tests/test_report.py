@@ -277,7 +277,8 @@ def test_only_marked_places_are_filled():
 def recorded(task, method):
     """Indicator (K, R) of recorded runs, read from their rows; a reference that shares nothing with the report."""
     curves = []
-    for path in sorted((report.ROOT / "results/study/cpu" / task / method).glob("seed*/metrics.csv")):
+    scale = "batch" if task == "g1_loco" else "cpu"
+    for path in sorted((report.ROOT / f"results/study/{scale}" / task / method).glob("seed*/metrics.csv")):
         with path.open() as file:
             rows = list(csv.DictReader(file))
         curves.append([float(row["progress" if "progress" in rows[0] else "episode_return"]) for row in rows])
@@ -291,9 +292,16 @@ def test_words_of_the_page_are_what_was_recorded():
     for task in report.TASKS:
         arms = [recorded(task, method) for method in ("pidm_pretrained", "pidm_random")]
         final = [arm[:, -max(arm.shape[1] // 20, 1) :].mean() for arm in arms]
-        first = [np.mean([1 + np.flatnonzero(run >= 0.9 * final[1])[0] for run in arm]) for arm in arms]
+        first, half = (
+            [np.mean([1 + np.flatnonzero(run >= share * final[1])[0] for run in arm]) for arm in arms]
+            for share in (0.9, 0.5)
+        )
         ends.append(100 * (final[0] / final[1] - 1))
         there.append(100 * (first[0] / first[1] - 1))
+    assert (
+        f"reaches 50% after {4 * half[0]:.0f} iterations, PIDM random after {4 * half[1]:.0f}" in text
+    )  # the last: G1
+    assert f"and ends {-ends[-1]:.1f}% lower" in text
     assert f"ends {np.mean(ends):.1f}% higher" in text and f"needs {-np.mean(there):.1f}% fewer iterations" in text
     gains = np.array(report.PAPER["to 90%"]["pidm_pretrained"]) < there
     assert gains.sum() == 7 and "seven of nine gains are smaller" in text
