@@ -48,7 +48,7 @@ def loco(body):
     same = ("ppo", "termination_reward", "lin_vel_x", "lin_vel_y", "command_seconds", "standing", "turning")
     same += ("on_the_spot", "tracking_seconds", "gait_hz", "swing_height")
     fields = {name: getattr(G1_LOCO, name) for name in same} | {"max_tilt": body["max_tilt"]}
-    fields["march"] = True  # H1, told to stand, put both feet down and fell in 16 of 20 episodes
+    fields["march"] = True  # H1, told to stand, fell once it had put both feet down
     robust |= ROBUST | {"tracking_seconds": 0.2, "lin_vel_x": (-0.8, 1.2)}
     return dataclasses.replace(GO1_LOCO, **shared(body), **fields, weights=weights, robust=robust)
 

@@ -232,6 +232,21 @@ def test_main_use_is_what_was_recorded():
     assert f"velocity by {result['lin_vel_error']:.2f} m/s and fell in {100 * result['falls']:.0f}% of" in text
 
 
+def test_robots_from_files_are_what_was_recorded():
+    text = " ".join(DOCS["your-robot"].split())
+    for name in ("go2", "h1"):
+        gait = read(f"your_robot/{name}", "eval.json")["gait"]
+        assert f"fell in {gait['falls']:.0f} of {gait['episodes']:.0f} episodes" in text
+    task, row = read("your_robot/h1", "eval.json")["task"], last_row(ROOT / "results/your_robot/h1")
+    minutes = float(row["seconds"]) / 60
+    assert f"After {minutes:.0f} minutes its velocity error was {task['lin_vel_error']:.2f} m/s" in text
+    assert f"and {gait['velocity_error']:.2f} at fixed commands to walk" in text
+    assert f"rises by {100 * gait['clearance']:.0f} cm" in text
+    assert f"{gait['switches/falls']:.0f} of {gait['switches/episodes']:.0f} at changing ones" in text
+    for fault in ("delay of 40 ms", "friction 0.3"):
+        assert gait[f"{fault}/falls"] == gait[f"{fault}/episodes"] == 40
+
+
 @pytest.mark.parametrize("robot", ["anymal_d", "go1"])
 def test_coverage_is_what_was_recorded(robot):
     result = read(f"pidm/{robot}", "coverage.json")
