@@ -247,7 +247,7 @@ def test_robots_from_files_are_what_was_recorded():
         assert gait[f"{fault}/falls"] == gait[f"{fault}/episodes"] == 40
 
 
-@pytest.mark.parametrize("robot", ["anymal_d", "go1"])
+@pytest.mark.parametrize("robot", ["anymal_d", "go1", "g1"])
 def test_coverage_is_what_was_recorded(robot):
     result = read(f"pidm/{robot}", "coverage.json")
     spaces = [f"{result[name]:.2f}" for name in result if name.startswith("joint space")]
