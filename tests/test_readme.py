@@ -228,7 +228,8 @@ def test_main_use_is_what_was_recorded():
     run = "study/batch/g1_loco/pidm_pretrained/seed0"
     row, result = last_row(ROOT / "results" / run), read(run, "eval.json")["task"]
     text = " ".join(README.split())
-    assert f"run of {float(row['env_steps']) / 1e6:.0f} M took {float(row['seconds']) / 60:.0f} minutes" in text
+    assert f"run of {float(row['env_steps']) / 1e6:.0f} M, with 512 environments" in text
+    assert f"first weights, took {float(row['seconds']) / 60:.0f} minutes" in text
     assert f"velocity by {result['lin_vel_error']:.2f} m/s and fell in {100 * result['falls']:.0f}% of" in text
 
 

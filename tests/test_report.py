@@ -298,9 +298,8 @@ def test_words_of_the_page_are_what_was_recorded():
         )
         ends.append(100 * (final[0] / final[1] - 1))
         there.append(100 * (first[0] / first[1] - 1))
-    assert (
-        f"reaches 50% after {4 * half[0]:.0f} iterations, PIDM random after {4 * half[1]:.0f}" in text
-    )  # the last: G1
+    # The last task is G1's, with a row every four iterations.
+    assert f"reaches 50% after {4 * half[0]:.0f} iterations, PIDM random after {4 * half[1]:.0f}" in text
     assert f"and ends {-ends[-1]:.1f}% lower" in text
     assert f"ends {np.mean(ends):.1f}% higher" in text and f"needs {-np.mean(there):.1f}% fewer iterations" in text
     gains = np.array(report.PAPER["to 90%"]["pidm_pretrained"]) < there
