@@ -469,8 +469,8 @@ def update(args, env, net, opt, state, batch, key):
     def minibatch(carry, inputs):
         params, opt_state, lr = carry
         batch, key = inputs
-        loss = partial(ppo_loss, args, env, net, log_std_old=log_std_old, batch=batch, key=key)
-        grads, losses = jax.grad(loss, has_aux=True)(params)
+        gradient = jax.grad(partial(ppo_loss, args, env, net, log_std_old=log_std_old, key=key), has_aux=True)
+        grads, losses = devices.mean_in_pieces(lambda piece: gradient(params, batch=piece), batch)
         lr = adapt_lr(args, lr, losses["kl"])
         grads, (losses["actor_grad_norm"], losses["critic_grad_norm"]) = clip_gradients(args, grads)
         updates, opt_state = opt.update(grads, opt_state)

@@ -4,6 +4,7 @@ The scripts read as for one device. The compiler adds the communication where th
 statistics are means over all environments, and minibatches are shuffled within each device's block of them.
 """
 
+import math
 import os
 import sys
 
@@ -13,6 +14,8 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from experiment import records
+
+PIECE = 2048  # samples whose activations fit the cache of a CPU core
 
 
 def join(distributed):
@@ -93,3 +96,20 @@ def place(tree, shardings):
         return jax.make_array_from_callback(whole.shape, sharding, lambda index: whole[index])
 
     return jax.tree.map(put, tree, shardings)
+
+
+def mean_in_pieces(function, batch):
+    """Return function(batch), which is a mean over samples; on a CPU, piece by piece, a large batch takes less time.
+
+    Leaves of batch are (B, ...). It is halved until a piece has at most PIECE samples, or an odd number.
+    """
+    size = len(jax.tree.leaves(batch)[0])
+    alone = jax.default_backend() == "cpu" and jax.device_count() == 1
+    count = math.gcd(size, 1 << ((size - 1) // PIECE).bit_length()) if alone else 1
+    pieces = jax.tree.map(lambda x: x.reshape(count, size // count, *x.shape[1:]), batch)
+    zero = jax.tree.map(jnp.zeros_like, jax.eval_shape(function, jax.tree.map(lambda x: x[0], pieces)))
+
+    def add(total, piece):
+        return jax.tree.map(jnp.add, total, function(piece)), None
+
+    return jax.tree.map(lambda x: x / count, jax.lax.scan(add, zero, pieces)[0])

@@ -16,6 +16,7 @@ import pytest
 import ppo_explore
 import ppo_finetune
 import pretrain_pidm
+from experiment import devices
 
 T, N, M, K = 8, 6, 4, 2  # rollout steps, environments, minibatches, history
 OBS, X, A = 7, 10, 3  # observation, proprioception, action
@@ -348,7 +349,9 @@ def orders(script, args, env, key):
 
     def epoch(key):
         k_order, k_mirror = jax.random.split(key)
-        chosen = [jax.random.randint(k, (), 0, len(env.mirrors)) for k in jax.random.split(k_mirror, M)]
+        chosen = [
+            jax.random.randint(k, (), 0, len(env.mirrors)) for k in jax.random.split(k_mirror, args.num_minibatches)
+        ]
         return script.minibatches(args, k_order, jnp.arange(T * N).reshape(T, N)), jnp.stack(chosen)
 
     order, chosen = jax.jit(jax.vmap(epoch))(jax.random.split(key, args.num_epochs))
@@ -395,11 +398,14 @@ STEPS = dict(num_envs=N, num_steps=T, num_epochs=3, num_minibatches=M, shuffle_b
 PPO = dict(gamma=0.9, gae_lambda=0.8, clip=0.1, value_coef=0.7, entropy_coef=0.02, mirror_coef=0.3, lr=2e-3)
 
 
-@pytest.mark.parametrize("network", ["mlp", "pidm"])
-def test_iteration_of_stage_three(network):
-    """Losses, gradients, step size and weights after 12 minibatch steps on a rollout."""
+@pytest.mark.parametrize(("network", "piece"), [("mlp", None), ("pidm", None), ("pidm", 8)])
+def test_iteration_of_stage_three(network, piece, monkeypatch):
+    """Losses, gradients, step size and weights after 12 minibatch steps on a rollout; or 9, each in two pieces of 8."""
     env, key, opt = Recording(0), jax.random.key(3), optax.scale_by_adam()
     args = ppo_finetune.Args(network=network, desired_kl=0.008, **STEPS, **PPO)
+    if piece:
+        monkeypatch.setattr(devices, "PIECE", piece)
+        args = dataclasses.replace(args, num_minibatches=3, desired_kl=0.004)
     if network == "mlp":
         net = ppo_finetune.ActorCritic((6, 5), A, 1.0)
     else:

@@ -440,3 +440,21 @@ def test_windows_line_ends_are_read(name, usual, tmp_path, monkeypatch):
 
 def test_devices_are_found_where_all_is_well():
     assert devices.find() is None
+
+
+@pytest.mark.parametrize(
+    ("size", "longest"), [(1, 1), (2048, 2048), (6144, 1536), (24576, 1536), (2050, 1025), (4097, 4097)]
+)
+def test_a_mean_in_pieces_is_the_mean(size, longest):
+    """Whatever the size of a batch; its pieces fit a CPU's cache where halving allows it."""
+    x = np.random.default_rng(size).normal(size=(size, 3)).astype(np.float32)
+    seen = set()
+
+    def function(batch):
+        seen.add(len(batch["x"]))
+        return {"mean": batch["x"].mean(0), "last": (batch["y"] ** 2).mean()}
+
+    got = devices.mean_in_pieces(function, {"x": x, "y": x[:, 0]})
+    np.testing.assert_allclose(got["mean"], x.astype(float).mean(0), atol=1e-6)
+    np.testing.assert_allclose(got["last"], (x[:, 0].astype(float) ** 2).mean(), rtol=1e-5)
+    assert seen == {longest}
