@@ -21,10 +21,12 @@ def pyplot():
 
 
 def save(fig, path, dpi=110):
-    """Write a figure in one step, the same bytes each time, and close it."""
-    image = io.BytesIO()
-    fig.savefig(image, format=path.suffix[1:], dpi=dpi, metadata={"Software": None})
-    pyplot().close(fig)
+    """Write a figure as PNG or SVG in one step, the same bytes each time, and close it."""
+    image, plt = io.BytesIO(), pyplot()
+    with plt.rc_context({"svg.hashsalt": "fixed", "svg.fonttype": "none"}):  # names of parts; text stays text
+        dated = "Date" if path.suffix == ".svg" else "Software"
+        fig.savefig(image, format=path.suffix[1:], dpi=dpi, metadata={dated: None})
+    plt.close(fig)
     records.replace_bytes(path, image.getvalue())
 
 
@@ -50,8 +52,13 @@ def plot_training(rows, path):
     plot_curves(rows, panels | {"reward terms per step": terms}, path)
 
 
-def plot_accuracy(change, error, path):
-    """Absolute and normalised error [rad] over the action magnitude |a - q| [rad], every joint a sample (Fig. 4c)."""
+def plot_accuracy(change, error, path, samples=1000):
+    """Absolute and normalised error [rad] over the action magnitude |a - q| [rad], both (B, A) (paper Fig. 4c).
+
+    Points are the joints of `samples` transitions drawn at random, lines are means and quartiles of all.
+    """
+    drawn = np.random.default_rng(0).choice(len(change), min(samples, len(change)), replace=False)
+    some = np.abs(change[drawn]).ravel(), np.abs(error[drawn]).ravel()
     size, error = np.abs(change).ravel(), np.abs(error).ravel()
     edges = np.linspace(0, np.quantile(size, 0.995), 21)
     bins = np.digitize(size, edges)
@@ -59,26 +66,28 @@ def plot_accuracy(change, error, path):
     magnitude = np.array([size for size, _ in rows])
     quantiles = np.array([np.quantile(errors, (0.25, 0.5, 0.75)) for _, errors in rows])
     mean = np.array([errors.mean() for _, errors in rows])
-    fig, axes = pyplot().subplots(1, 2, figsize=(7.5, 3), constrained_layout=True)
-    for ax, unit, title in zip(
-        axes, (1.0, magnitude), ("absolute error [rad]", "error / action magnitude"), strict=True
-    ):
-        ax.plot(magnitude, mean / unit, label="mean")
-        ax.fill_between(magnitude, quantiles[:, 0] / unit, quantiles[:, 2] / unit, alpha=0.25, label="25 % to 75 %")
-        ax.set(xlabel="action magnitude |a - q| [rad]", title=title, ylim=(0, None))
+    fig, axes = pyplot().subplots(1, 2, figsize=(9, 3.6), constrained_layout=True)
+    for ax, unit, part in zip(axes, (1.0, magnitude), (1.0, np.maximum(some[0], 1e-6)), strict=True):
+        ax.plot(some[0], some[1] / part, ".", ms=2, alpha=0.25, mew=0, color="0.4", label=f"{len(drawn)} transitions")
+        ax.fill_between(magnitude, quantiles[:, 0] / unit, quantiles[:, 2] / unit, alpha=0.35, label="25% to 75%")
+        ax.plot(magnitude, mean / unit, lw=2, label="mean")
+        ax.set(xlabel="action magnitude |a - q| [rad]", xlim=(0, edges[-1]))
         ax.grid(alpha=0.3)
-    axes[0].legend()
-    axes[1].set_ylim(0, 2)
+    axes[0].set(ylabel="error of the joint target [rad]", ylim=(0, np.quantile(error, 0.995)))
+    axes[1].set(ylabel="the same / action magnitude", yscale="log", ylim=(0.03, 30))
+    axes[0].legend(markerscale=5, loc="upper left")
     save(fig, path)
 
 
 def plot_distribution(magnitude, rough, path):
     """Distribution of the action magnitude (B, A) [rad] on flat and on rough (B,) ground (paper Fig. 4b)."""
     fig, ax = pyplot().subplots(figsize=(4.5, 3), constrained_layout=True)
-    for label, chosen in (("flat", ~rough), ("rough", rough)):
+    edges = np.linspace(0, np.quantile(magnitude, 0.999), 41)
+    for label, chosen, line in (("flat", ~rough, "-"), ("rough", rough, "--")):
         if chosen.any():
-            bins = np.linspace(0, magnitude.max(), 61)
-            ax.hist(magnitude[chosen].ravel(), bins=bins, density=True, alpha=0.5, label=label)
-    ax.set(xlabel="action magnitude |a - q| [rad]", ylabel="density")
+            density, _ = np.histogram(magnitude[chosen], edges, density=True)
+            ax.stairs(density, edges, lw=1.5, ls=line, label=label)
+    ax.set(xlabel="action magnitude |a - q| [rad]", ylabel="density", xlim=(0, edges[-1]), ylim=(0, None))
+    ax.grid(alpha=0.3)
     ax.legend()
     save(fig, path)

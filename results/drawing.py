@@ -10,6 +10,7 @@ from experiment import figures
 from results import measures
 from results.grid import ANYMAL, GO1, METHODS, TABLE_1, TASKS
 
+WALKING = GO1 + ANYMAL  # tasks that are run at several batches
 MODULES = ("intention_encoder", "history_encoder", "backbone", "action_synthesizer")  # of the actor
 COLOURS = {  # of a method; dashed if only its initial weights differ
     "mlp": "#009E73",
@@ -95,6 +96,7 @@ def draw_curves(study, path, methods=TABLE_1, extra=None):
     dots = "dots: mean iteration at which a run gets there; hollow if some do not, and count by their length"
     legend_below(fig, axes.ravel(), f"{SHADE}\n{dots}", columns=4 if columns > 1 else 3)
     figures.save(fig, path, dpi=80)
+    return True
 
 
 def draw_controls(study, path):
@@ -209,7 +211,7 @@ def by_batch(loaded, task):
 
 def draw_batch(loaded, path):
     """What pretraining brings over the number of environments (scale -> task -> runs), on the walking quadrupeds."""
-    found = {task: by_batch(loaded, task) for task in GO1 + ANYMAL}
+    found = {task: by_batch(loaded, task) for task in WALKING}
     if max(map(len, found.values())) < 2:
         return False
     fig, (axes,) = panels(1, 3, 3.6)

@@ -39,6 +39,7 @@ from experiment import devices, figures, records
 SIZES = (7_000, 70_000, 700_000)  # transitions; the fourth of the paper's sizes, 7 M, is the shipped PIDM
 EXPLORE = ("--total-steps", "7600000")
 PRETRAIN = ("--epochs", "100", "--patience", "10")
+BLIND = ("anymal_loco", "anymal_pedipulation", "go1_loco", "g1_loco")  # tasks on flat ground without perception
 EARLY = 100  # iterations of a task's training whose states the coverage figure shows (paper Fig. 4a)
 
 
@@ -245,8 +246,8 @@ def project(sets):
 
 
 def look(args, robot):
-    """Compare the coverage of exploration, random actions and a task's first iterations: numbers and a figure."""
-    task = robot.removesuffix("_d") + "_loco"
+    """Compare the coverage of exploration, random actions and first iterations of tasks: numbers and a figure."""
+    tasks = [task for task in BLIND if envs.TASKS[task][1].robot == robot]
     random = f"runs/explore/{robot}/random"
     if not (ROOT / random / "meta.json").exists():
         words = ("--robot", robot, "--preset", args.preset, "--policy", "random", "--run-dir", random, "--force")
@@ -255,23 +256,48 @@ def look(args, robot):
     kinds = {
         "exploration": sample(ROOT / f"runs/explore/{robot}/seed0"),
         "random actions": sample(ROOT / random),
-        f"first {EARLY} iterations of {task}": early_states(task),
+        **{f"first {EARLY} iterations of {task}": early_states(task) for task in tasks},
     }
     folder = ROOT / f"results/pidm/{robot}"
     coverage = {f"joint space, {name}": occupied(env, x) for name, x in kinds.items()}
     coverage |= measure_novelty(
         env, pretrain_pidm.Dataset(ROOT / f"runs/explore/{robot}/seed0"), folder / "novelty.png"
     )
-    coverage[f"normalized_error, recorded policy of {task}"] = walking_error(robot, task)
+    coverage[f"normalized_error, recorded policy of {tasks[0]}"] = walking_error(robot, tasks[0])
+    name, points = project([x[::5] for x in kinds.values()])
+    found = draw_coverage(dict(zip(kinds, points, strict=True)), f"{name} of x_t, {robot}", folder / "coverage.png")
+    coverage |= {f"where exploration has been on the map, {kind}": share for kind, share in found.items()}
     print(robot, records.line(coverage))
     records.replace_text(folder / "coverage.json", json.dumps(coverage, indent=1) + "\n")
-    name, points = project([x[::5] for x in kinds.values()])
-    fig, ax = figures.pyplot().subplots(figsize=(5, 4), constrained_layout=True)
-    for label, xy in zip(kinds, points, strict=True):
-        ax.scatter(*xy.T, s=1, alpha=0.4, label=label)
-    ax.set(title=f"{name} of x_t, {robot}", xticks=[], yticks=[])
-    ax.legend(markerscale=8, fontsize=8)
-    figures.save(fig, folder / "coverage.png")
+
+
+def draw_coverage(points, title, path, gridsize=30):
+    """Draw a map of each set of states, name -> (S, 2), over the cells that the first one visits.
+
+    Returns the share of the samples of each other set that is in these cells.
+    """
+    everything, (explored, *_) = np.concatenate([*points.values()]), points.values()
+    pad = 0.02 * np.ptp(everything, axis=0)
+    extent = np.stack([everything.min(0) - pad, everything.max(0) + pad], 1).ravel()
+    cells = {"gridsize": gridsize, "extent": extent, "linewidths": 0.1}
+    size = 3.2 * len(points), 3.4
+    fig, axes = figures.pyplot().subplots(1, len(points), figsize=size, layout="constrained", sharex=True, sharey=True)
+    share = {}
+    for ax, (name, xy) in zip(axes, points.items(), strict=True):
+        visited = ax.hexbin(*explored.T, mincnt=1, **cells)
+        visited.set(array=None, facecolor="0.85")
+        shown = ax.hexbin(*xy.T, mincnt=1, norm="log", vmin=1, vmax=100, cmap="viridis_r", **cells)
+        ax.set(title=name.replace(" of ", " of\n"), xticks=[], yticks=[])
+        if xy is not explored:
+            known = {tuple(cell) for cell in visited.get_offsets()}
+            inside = [tuple(cell) in known for cell in shown.get_offsets()]
+            share[name] = float(shown.get_array()[inside].sum() / len(xy))
+            ax.set_xlabel(f"{100 * share[name]:.0f}% in cells that exploration visits")
+    axes[0].set_xlabel("grey in the others")
+    fig.colorbar(shown, ax=axes, label="samples in a cell")
+    fig.suptitle(title)
+    figures.save(fig, path)
+    return share
 
 
 HEAD = """# Shipped PIDM checkpoints

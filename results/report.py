@@ -261,6 +261,23 @@ def controls(study):
     return markdown(rows)
 
 
+def batches_table(loaded):
+    """What pretraining brings at each batch of a walking quadruped, of those with several; and what the MLP does."""
+    rows = []
+    for task in drawing.WALKING:
+        found = drawing.by_batch(loaded, task)
+        for count in sorted(found) if len(found) > 1 else ():
+            runs = found[count]
+            row = {"task": TASKS[task], "batch": batch(runs), "seeds": measures.seeds(runs, TABLE_1)}
+            for method in ("pidm_pretrained", "mlp"):
+                title = METHODS[method].title.removeprefix("PIDM ")
+                for name in ("final", "area", "to 50%", "to 90%"):
+                    what = {"final": "final", "area": "mean of training"}.get(name, name)
+                    row[f"{what}: {title} [%]"] = shown(measures.compare(task, runs, method, name))
+            rows.append(row)
+    return markdown(without_empty(rows)) if rows else ["One batch so far."]
+
+
 def updates_table(study):
     """Change [%] of the actor's updates in the first iterations, pretrained against random; also per step size."""
     rows = []
@@ -388,12 +405,15 @@ def load_study():
 
 
 def pick(loaded, methods=TABLE_1):
-    """Runs of each task at the scale that has most of these methods, the later of grid.py if several have."""
+    """Runs of each task at the scale that has most of these methods, of each at most two seeds counting.
+
+    The later of grid.py where several have as many: a larger batch takes the place of a smaller one at two seeds.
+    """
     chosen = {}
     for task in TASKS:
         studies = [study[task] for study in reversed(loaded.values()) if task in study]
         if studies:
-            chosen[task] = max(studies, key=lambda runs: len({*methods} & runs.keys()))
+            chosen[task] = max(studies, key=lambda runs: sum(min(len(runs.get(m, ())), 2) for m in methods))
     return chosen
 
 
@@ -427,6 +447,7 @@ def blocks(loaded):
         "table 2": ablation(pick(loaded, titles("table 2")), titles("table 2") | main, climbing),
         "sizes": sizes(pick(loaded, titles("sizes")), titles("sizes") | main, climbing),
         "controls": controls(pick(loaded, sum(CONTROLS, ()))),
+        "batch": batches_table(loaded),
         "updates": updates_table(study),
         "accuracy": pidm_table(),
     }
@@ -449,17 +470,18 @@ def details(loaded):
 def draw_all(loaded):
     """Draw the figures that the runs allow, and remove those that they no longer allow."""
     study = pick(loaded)
-    drawing.draw_curves(study, STUDY / "curves.png")
     drawn = {
-        "controls.png": lambda path: drawing.draw_controls(pick(loaded, sum(CONTROLS, ())), path),
-        "updates.png": lambda path: drawing.draw_updates(study, path),
-        "success.png": lambda path: drawing.draw_success(study, path),
-        "sizes.png": lambda path: drawing.draw_sizes(pick(loaded, titles("sizes")), path, sizes_of("anymal_d")),
-        "batch.png": lambda path: drawing.draw_batch(loaded, path),
+        "curves": lambda path: drawing.draw_curves(study, path),
+        "controls": lambda path: drawing.draw_controls(pick(loaded, sum(CONTROLS, ())), path),
+        "updates": lambda path: drawing.draw_updates(study, path),
+        "success": lambda path: drawing.draw_success(study, path),
+        "sizes": lambda path: drawing.draw_sizes(pick(loaded, titles("sizes")), path, sizes_of("anymal_d")),
+        "batch": lambda path: drawing.draw_batch(loaded, path),
     }
     for name, draw in drawn.items():
-        if not draw(STUDY / name):
-            (STUDY / name).unlink(missing_ok=True)
+        for path in (STUDY / f"{name}.png", STUDY / f"{name}.svg"):  # for the pages, and for print
+            if not draw(path):
+                path.unlink(missing_ok=True)
 
 
 def beside(folder):

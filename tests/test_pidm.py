@@ -16,6 +16,7 @@ import envs
 import ppo_finetune as finetune
 import pretrain_pidm as script
 from experiment import records
+from results import pidm
 
 K, X, A = 5, 30, 12  # Go1
 LAYOUT = ["ang_vel", "gravity", "joint_pos", "joint_vel"]
@@ -606,3 +607,14 @@ def test_batches_are_all_of_the_index_in_order(dataset):
 def test_load_into_without_pretrained_is_refused(load_into, refused):
     args = finetune.Args(preset="smoke", load_into=load_into)
     refused(finetune.main, args, f"--load-into {load_into} needs --pretrained")
+
+
+def test_the_map_counts_the_states_where_exploration_has_been(tmp_path):
+    """A quarter of the first set lies in exploration's corner, all of the second, none of the third."""
+    rng = np.random.default_rng(0)
+    near, far = rng.random((300, 2)), 5 + rng.random((900, 2))
+    rest = [*far, [9.0, 9.0]]  # a corner of the map
+    sets = {"exploration": rng.random((3000, 2)), "some": np.array([*near, *far]), "all": near, "none": np.array(rest)}
+    share = pidm.draw_coverage(sets, "map", tmp_path / "coverage.png", gridsize=12)
+    assert share == {"some": 0.25, "all": 1.0, "none": 0.0}
+    assert (tmp_path / "coverage.png").stat().st_size > 10_000

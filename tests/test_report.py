@@ -326,8 +326,9 @@ def test_report_writes_the_same_bytes_twice(tmp_path, monkeypatch):
     images = []
     for _ in range(2):
         report.draw_all({"cpu": study})
-        images.append({path.name: path.read_bytes() for path in tmp_path.glob("*.png")})
-    assert images[0] == images[1] and {*images[0]} == {"curves.png", "controls.png"}  # what one task of walking allows
+        images.append({path.name: path.read_bytes() for path in tmp_path.iterdir()})
+    assert images[0] == images[1]
+    assert {*images[0]} == {f"{name}.{kind}" for name in ("curves", "controls") for kind in ("png", "svg")}
 
 
 def test_figures_of_parkour_and_updates_are_drawn(tmp_path, monkeypatch):
@@ -335,22 +336,28 @@ def test_figures_of_parkour_and_updates_are_drawn(tmp_path, monkeypatch):
     monkeypatch.setattr(report, "STUDY", tmp_path)
     names = ("anymal_jump", "anymal_pedipulation")
     study = {name: report.load_task(report.ROOT / f"results/study/cpu/{name}") for name in names}
-    report.draw_all({"cpu": study})
-    assert {path.name for path in tmp_path.glob("*.png")} == {"curves.png", "success.png", "updates.png"}
-    report.draw_all({"cpu": {"anymal_jump": study["anymal_jump"]}})
-    assert {path.name for path in tmp_path.glob("*.png")} == {"curves.png", "success.png"}
+
+    def drawn(study):
+        report.draw_all({"cpu": study})
+        return sorted(path.name for path in tmp_path.iterdir())
+
+    assert drawn(study) == [f"{name}.{kind}" for name in ("curves", "success", "updates") for kind in ("png", "svg")]
+    assert drawn({"anymal_jump": study["anymal_jump"]}) == ["curves.png", "curves.svg", "success.png", "success.svg"]
 
 
 def test_each_table_takes_the_scale_that_has_most_of_its_methods():
-    """A scale under way does not replace a complete one, and replaces it at once when it is as complete.
+    """A scale under way does not replace one that is as complete or has several seeds; it does with two of its own.
 
-    Catches runs of two scales in one row, and controls that vanish while Table I moves to another scale.
+    Catches runs of two scales in one row, controls that vanish while Table I moves to another scale, and a single seed
+    in the place of five.
     """
-    small = {method: flat(1.0) for method in (*report.TABLE_1, "pidm_shuffled")}
-    large = {method: flat(2.0) for method in report.TABLE_1[1:]}
+    small = {method: flat(1.0, 1.0, 1.0) for method in (*report.TABLE_1, "pidm_shuffled")}
+    large = {method: flat(2.0, 2.0) for method in report.TABLE_1[1:]}
     loaded = {"cpu": {"go1_loco": small, "g1_loco": small}, "batch": {"go1_loco": large}}
     assert report.pick(loaded) == {"go1_loco": small, "g1_loco": small}
     large["mlp"] = flat(3.0)
+    assert report.pick(loaded)["go1_loco"] is small
+    large["mlp"] = flat(3.0, 3.0)
     assert report.pick(loaded)["go1_loco"] is large and report.pick(loaded)["g1_loco"] is small
     assert report.pick(loaded, ("pidm_random", "pidm_shuffled"))["go1_loco"] is small
 
@@ -359,14 +366,18 @@ def test_what_pretraining_brings_is_drawn_over_the_batch(tmp_path):
     """Of two scales of 256 environments the later one counts; one batch alone is no figure."""
 
     def arms(num_envs, *ends):
-        settings = {"settings": {"num_envs": num_envs}}
+        settings = {"settings": {"num_envs": num_envs, "num_steps": 24}}
         both = {"pidm_random": flat(10.0, 11.0), "pidm_pretrained": flat(*ends)}
         return {"go1_loco": {method: [run | settings for run in runs] for method, runs in both.items()}}
 
     loaded = {"cpu": arms(256, 9.0, 10.0), "256": arms(256, 10.0, 10.0), "batch": arms(4096, 12.0, 13.0)}
     assert drawing.by_batch(loaded, "go1_loco") == {256: loaded["256"]["go1_loco"], 4096: loaded["batch"]["go1_loco"]}
     assert drawing.draw_batch(loaded, tmp_path / "batch.png") and (tmp_path / "batch.png").stat().st_size > 5000
-    assert not drawing.draw_batch({"cpu": loaded["cpu"], "256": loaded["256"]}, tmp_path / "none.png")
+    _, _, *rows = [re.split(r" ?\| ?", line) for line in report.batches_table(loaded)]
+    assert [(row[2], row[4][:5]) for row in rows] == [("256 x 24", "-4.8 "), ("4096 x 24", "+19.0")]
+    one_batch = {"cpu": loaded["cpu"], "256": loaded["256"]}
+    assert not drawing.draw_batch(one_batch, tmp_path / "none.png")
+    assert report.batches_table(one_batch) == ["One batch so far."]
 
 
 @pytest.fixture
