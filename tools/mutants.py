@@ -252,6 +252,17 @@ FAULTS = {  # (file, tests, words for -k) -> faults: name, old text, new text
     ("envs/pedipulation.py", "test_parkour", "pedipulation_target"): [
         ("a point seen from a frame turned twice", "inverse(motion.quat), task.point", "motion.quat, task.point"),
     ],
+    ("experiment/devices.py", "test_world", "pieces"): [
+        ("pieces are summed", "lambda x: x / count, jax", "lambda x: x, jax"),
+        ("a batch is never split", "1 << ((size - 1) // PIECE).bit_length()", "1"),
+    ],
+    ("experiment/devices.py", "test_reference", "stage_three and 8"): [
+        (
+            "each piece counts twice",
+            "jnp.add, total, function(piece))",
+            "lambda a, b: a + 2 * b, total, function(piece))",
+        ),
+    ],
     ("experiment/records.py", "test_metrics", "two_seeds"): [
         ("the last row is not saved", "writer.writerows(rows)", "writer.writerows(rows[:-1])"),
     ],
