@@ -1,7 +1,7 @@
 """Figures of the study: curves, controls, updates, success by level, and the size of the pretraining set.
 
-Each function writes one file, the same bytes each time. Those that return a bool write nothing, and return False, where
-the runs do not allow the figure.
+Each function writes one file, the same bytes each time, and returns True; or nothing, and False, where the runs do not
+allow the figure.
 """
 
 import numpy as np
@@ -86,6 +86,8 @@ def draw_task(ax, task, runs, methods, extra=None):
 
 def draw_curves(study, path, methods=TABLE_1, extra=None):
     """Indicator over iterations, a panel per task. `extra` (label, iteration, value) is on top."""
+    if not study:
+        return False
     columns = min(len(study), 3)
     alone = {"width": 8.0, "height": 5.5} if columns == 1 else {}
     fig, axes = panels(-(-len(study) // columns), columns, **alone)

@@ -309,6 +309,7 @@ magnitude |a_t - q_t|, joint target minus joint angle: the paper's normalised er
 is over the mean action.
 
 Joint space is the share of a 20 x 20 grid over each pair of neighbouring joints of a limb that 20,000 samples visit.
+Maps have a panel for each set of states, 4,000 of each. Grey cells are those that exploration visits.
 Disagreement is that of an ensemble trained on the first tenth of the collection, there (seen) and on the last tenth
 (novel). The recorded policy is that of results/tasks, with its noise: a gait that the PIDM never saw. Features are the
 outputs of the actor's backbone in the first rollout of a task. Their effective rank (Roy and Vetterli 2007) is the

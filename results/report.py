@@ -467,11 +467,19 @@ def details(loaded):
     return "\n".join(parts).rstrip() + "\n"
 
 
+def larger(loaded, study):
+    """Runs of the walking quadrupeds at their largest batch, where a study of `pick` has a smaller one."""
+    found = {task: drawing.by_batch(loaded, task) for task in drawing.WALKING}
+    largest = {task: runs[max(runs)] for task, runs in found.items() if runs}
+    return {task: runs for task, runs in largest.items() if runs is not study[task]}
+
+
 def draw_all(loaded):
     """Draw the figures that the runs allow, and remove those that they no longer allow."""
     study = pick(loaded)
     drawn = {
         "curves": lambda path: drawing.draw_curves(study, path),
+        "curves_larger": lambda path: drawing.draw_curves(larger(loaded, study), path),
         "controls": lambda path: drawing.draw_controls(pick(loaded, sum(CONTROLS, ())), path),
         "updates": lambda path: drawing.draw_updates(study, path),
         "success": lambda path: drawing.draw_success(study, path),
