@@ -274,10 +274,10 @@ def test_only_marked_places_are_filled():
     assert report.filled(page, {"table 1": ["| x |"], "": ["| y |"]}) == page
 
 
-def recorded(task, method):
+def recorded(task, method, scale=None):
     """Indicator (K, R) of recorded runs, read from their rows; a reference that shares nothing with the report."""
     curves = []
-    scale = "batch" if task == "g1_loco" else "cpu"
+    scale = scale or ("batch" if task == "g1_loco" else "cpu")
     for path in sorted((report.ROOT / f"results/study/{scale}" / task / method).glob("seed*/metrics.csv")):
         with path.open() as file:
             rows = list(csv.DictReader(file))
@@ -310,6 +310,20 @@ def test_words_of_the_page_are_what_was_recorded():
         recorded("go1_loco", f"pidm_{m}_orthogonal")[:, -4:].mean() for m in ("pretrained", "random")
     )
     assert f"costs Go1 {100 * (1 - with_loaded / without):.1f}%" in text
+
+
+def test_words_on_the_batch_are_what_was_recorded():
+    """Of Go1 with 4096 environments, a row an iteration; in the project's README as well."""
+    ((loaded,), (random,)) = (recorded("go1_loco", f"pidm_{m}", "batch") for m in ("pretrained", "random"))
+    ends = loaded[-7:].mean(), random[-7:].mean()
+    first = [[1 + int(np.argmax(run >= share * ends[1])) for run in (loaded, random)] for share in (0.5, 0.9)]
+    gain, fewer = 100 * (ends[0] / ends[1] - 1), 100 * (1 - first[1][0] / first[1][1])
+    pages = [" ".join((report.ROOT / name).read_text().split()) for name in ("results/README.md", "README.md")]
+    assert "to 50% after {} iterations in place of {}".format(*first[0]) in pages[0]
+    assert "to 90% after {} in place of {} ({:.0f}% fewer".format(*first[1], fewer) in pages[0]
+    assert f"ends {gain:.1f}% higher (paper 3.6%)" in pages[0]
+    assert (loaded > random)[5:].all() and not (loaded > random)[4] and "ahead from the sixth iteration" in pages[0]
+    assert f"needs {fewer:.0f}% fewer iterations and ends {gain:.0f}% higher" in pages[1]
 
 
 def test_other_pages_are_what_their_records_give(monkeypatch):
