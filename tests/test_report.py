@@ -314,16 +314,19 @@ def test_words_of_the_page_are_what_was_recorded():
 
 def test_words_on_the_batch_are_what_was_recorded():
     """Of Go1 with 4096 environments, a row an iteration; in the project's README as well."""
-    ((loaded,), (random,)) = (recorded("go1_loco", f"pidm_{m}", "batch") for m in ("pretrained", "random"))
-    ends = loaded[-7:].mean(), random[-7:].mean()
-    first = [[1 + int(np.argmax(run >= share * ends[1])) for run in (loaded, random)] for share in (0.5, 0.9)]
+    runs = [recorded("go1_loco", m, "batch")[0] for m in ("pidm_pretrained", "pidm_random", "mlp")]
+    loaded, random, _ = runs
+    ends = [run[-7:].mean() for run in runs]
+    first = [[1 + int(np.argmax(run >= share * ends[1])) for run in runs] for share in (0.5, 0.9)]
     gain, fewer = 100 * (ends[0] / ends[1] - 1), 100 * (1 - first[1][0] / first[1][1])
     pages = [" ".join((report.ROOT / name).read_text().split()) for name in ("results/README.md", "README.md")]
-    assert "to 50% after {} iterations in place of {}".format(*first[0]) in pages[0]
-    assert "to 90% after {} in place of {} ({:.0f}% fewer".format(*first[1], fewer) in pages[0]
+    assert "to 50% after {} iterations in place of {}".format(*first[0][:2]) in pages[0]
+    assert "to 90% after {} in place of {} ({:.0f}% fewer".format(*first[1][:2], fewer) in pages[0]
     assert f"ends {gain:.1f}% higher (paper 3.6%)" in pages[0]
     assert (loaded > random)[5:].all() and not (loaded > random)[4] and "ahead from the sixth iteration" in pages[0]
     assert f"needs {fewer:.0f}% fewer iterations and ends {gain:.0f}% higher" in pages[1]
+    assert f"90% after {first[1][2]}, a final return {100 * (ends[2] / ends[1] - 1):.1f}% above" in pages[0]
+    assert f"needs {100 * (1 - first[1][2] / first[1][1]):.0f}% fewer. " in pages[1]
 
 
 def test_other_pages_are_what_their_records_give(monkeypatch):
