@@ -469,9 +469,12 @@ def details(loaded):
 
 def larger(loaded, study):
     """Runs of the walking quadrupeds at their largest batch, where a study of `pick` has a smaller one."""
+
+    def num_envs(runs):
+        return next(iter(runs.values()))[0]["settings"]["num_envs"]
+
     found = {task: drawing.by_batch(loaded, task) for task in drawing.WALKING}
-    largest = {task: runs[max(runs)] for task, runs in found.items() if runs}
-    return {task: runs for task, runs in largest.items() if runs is not study[task]}
+    return {task: runs[max(runs)] for task, runs in found.items() if runs and max(runs) > num_envs(study[task])}
 
 
 def draw_all(loaded):

@@ -389,7 +389,9 @@ def test_what_pretraining_brings_is_drawn_over_the_batch(tmp_path):
 
     loaded = {"cpu": arms(256, 9.0, 10.0), "256": arms(256, 10.0, 10.0), "batch": arms(4096, 12.0, 13.0)}
     study = report.pick(loaded, ("pidm_random", "pidm_pretrained"))
-    assert not report.larger(loaded, study) and report.larger(loaded, loaded["256"]) == loaded["batch"]
+    assert not report.larger(loaded, study)
+    assert report.larger(loaded, loaded["cpu"]) == report.larger(loaded, loaded["256"]) == loaded["batch"]
+    assert not report.larger({"cpu": loaded["cpu"], "256": loaded["256"]}, loaded["cpu"])  # as large, another scale
     assert drawing.by_batch(loaded, "go1_loco") == {256: loaded["256"]["go1_loco"], 4096: loaded["batch"]["go1_loco"]}
     assert drawing.draw_batch(loaded, tmp_path / "batch.png") and (tmp_path / "batch.png").stat().st_size > 5000
     _, _, *rows = [re.split(r" ?\| ?", line) for line in report.batches_table(loaded)]
