@@ -178,6 +178,23 @@ def test_the_page_is_served(walker, port, capsys):
     assert f"open http://127.0.0.1:{port} in a browser; Ctrl-C ends" in capsys.readouterr().out
 
 
+def test_an_interrupt_is_not_lost():
+    """Even where Python swallows exceptions, as in a finalizer; a second one interrupts at once."""
+
+    class Swallowing:
+        def __del__(self):
+            signal.raise_signal(signal.SIGINT)
+
+    before = signal.getsignal(signal.SIGINT)
+    with viewer.until_interrupted() as wanted:
+        assert wanted()
+        Swallowing()
+        assert not wanted()
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+    assert signal.getsignal(signal.SIGINT) is before
+
+
 def test_two_pages_are_served_at_once(port):
     """Needs requirements-watch.txt: the second --web takes another port and prints it; Ctrl-C ends both."""
     pytest.importorskip("mjviser")

@@ -4,9 +4,12 @@ One robot runs in real time with the task's own physics and noise. Sliders and k
 control step reads.
 """
 
+import contextlib
 import os
+import signal
 import socket
 import sys
+import threading
 import time
 
 import jax
@@ -67,6 +70,7 @@ class Watched:
         self.jitted_reset = jax.jit(lambda key, curriculum: env.reset(key, curriculum=curriculum))
         self.jitted_step = jax.jit(step)
         self.restart()
+        self.jitted_step(self.state, np.float32(self.command), np.float32(self.kick))  # compiles, before one can watch
         self.model = render.build(env, self.state.physics).compile()
         self.data = mujoco.MjData(self.model)
         self.update_picture()
@@ -117,6 +121,26 @@ class Watched:
             self.command = pressed(key, self.command, self.low, self.high)
 
 
+@contextlib.contextmanager
+def until_interrupted():
+    """Yield a function: True until Ctrl-C or SIGTERM. A second one interrupts at once.
+
+    The exception of a first one could strike, and be lost, inside a callback of JAX or of the server.
+    """
+    signals, stopped = (signal.SIGINT, signal.SIGTERM), threading.Event()
+
+    def stop(number, _):
+        stopped.set()
+        signal.signal(number, signal.default_int_handler)
+
+    previous = {number: signal.signal(number, stop) for number in signals}
+    try:
+        yield lambda: not stopped.is_set()
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+
+
 def run(robot, running, draw):
     """Make control steps in real time, or slower if the machine cannot, while running()."""
     while running():
@@ -128,17 +152,16 @@ def run(robot, running, draw):
 
 
 def window(robot):
-    """Show the robot in MuJoCo's viewer, until it is closed. UserError if there is no display."""
+    """Show the robot in MuJoCo's viewer, until it is closed or Ctrl-C. UserError if there is no display."""
     if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         raise records.UserError("--viewer needs a display; use --web, or --video FILE")
     import mujoco.viewer
 
     print(HELP)
-    with mujoco.viewer.launch_passive(
-        robot.model, robot.data, key_callback=robot.press, show_left_ui=False, show_right_ui=False
-    ) as viewer:
+    options = {"key_callback": robot.press, "show_left_ui": False, "show_right_ui": False}
+    with until_interrupted() as wanted, mujoco.viewer.launch_passive(robot.model, robot.data, **options) as viewer:
         follow(viewer.cam)
-        run(robot, viewer.is_running, viewer.sync)
+        run(robot, lambda: wanted() and viewer.is_running(), viewer.sync)
 
 
 def follow(camera):
@@ -160,14 +183,13 @@ def browser(robot, host="127.0.0.1", port=8080, running=lambda: True):
     check_address(host, port)
     server = viser.ViserServer(host, port)
     other = f" (port {port} is taken)" if server.get_port() != port else ""
-    print(f"open http://{host}:{server.get_port()} in a browser{other}; Ctrl-C ends", flush=True)
     try:
-        scene = mjviser.ViserMujocoScene(server, robot.model, num_envs=1)
-        add_controls(server.gui, robot)
-        scene.create_scene_gui(camera_distance=3.0)
-        run(robot, running, lambda: scene.update_from_mjdata(robot.data))
-    except KeyboardInterrupt:
-        pass
+        with until_interrupted() as wanted:
+            print(f"open http://{host}:{server.get_port()} in a browser{other}; Ctrl-C ends", flush=True)
+            scene = mjviser.ViserMujocoScene(server, robot.model, num_envs=1)
+            add_controls(server.gui, robot)
+            scene.create_scene_gui(camera_distance=3.0)
+            run(robot, lambda: wanted() and running(), lambda: scene.update_from_mjdata(robot.data))
     finally:
         server.stop()
 
