@@ -32,7 +32,7 @@ def start(words, flags="", **variables):
 
 def finish(*processes):
     """Wait for processes that must succeed. Returns what they printed."""
-    outputs = [process.communicate(timeout=280) for process in processes]
+    outputs = [process.communicate(timeout=900) for process in processes]
     for process, (_, err) in zip(processes, outputs, strict=True):
         assert process.returncode == 0, err
     return [out for out, _ in outputs]
@@ -85,7 +85,7 @@ def test_what_cannot_be_split_is_refused(changes, words, tmp_path, refused, monk
 def test_strangers_are_refused():
     """--distributed where nothing says who this process is; in a process of its own, for JAX must not have started."""
     process = start(["ppo_finetune.py", "--distributed"])
-    _, err = process.communicate(timeout=120)
+    _, err = process.communicate(timeout=600)
     assert process.returncode == 2 and err.startswith("error: --distributed: ") and "experiment/devices.py" in err, err
 
 

@@ -64,10 +64,10 @@ def test_killed_at_any_moment(script, data, tmp_path, monkeypatch):
         with subprocess.Popen(
             [sys.executable, script, *map(str, words)], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
         ) as process:
-            patience = time.monotonic() + 120
+            patience = time.monotonic() + 600
             while not (out / records.STATE).exists() or saved_rows(out) <= before:
                 assert process.poll() is None, process.stdout.read().decode()
-                assert time.monotonic() < patience, "no new row in two minutes"
+                assert time.monotonic() < patience, "no new row in ten minutes"
                 time.sleep(0.05)
             time.sleep(rng.uniform(0.0, 0.5))
             process.kill()

@@ -26,7 +26,7 @@ SMOKE = script.Args(preset="smoke")
 def run(*arguments, **kwargs):
     """A script with its arguments in a process of its own. Returns the finished process."""
     command = [sys.executable, *map(str, arguments)]
-    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300, check=False, **kwargs)
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=900, check=False, **kwargs)
 
 
 @pytest.fixture(scope="module")

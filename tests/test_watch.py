@@ -169,7 +169,7 @@ def test_the_page_is_served(walker, port, capsys):
     start, pages = int(walker.state.clock), []
 
     def running():
-        with urllib.request.urlopen(f"http://127.0.0.1:{port}", timeout=20) as page:
+        with urllib.request.urlopen(f"http://127.0.0.1:{port}", timeout=120) as page:
             pages.append(page.read())
         return len(pages) < 4
 
@@ -207,12 +207,12 @@ def test_two_pages_are_served_at_once(port):
         assert f"http://127.0.0.1:{port}" in urls and len({*urls}) == 2
         assert sum(f"(port {port} is taken)" in line for line in lines) == 1
         for url in urls:
-            with urllib.request.urlopen(url, timeout=20) as page:
+            with urllib.request.urlopen(url, timeout=120) as page:
                 assert b"<html" in page.read().lower()
     finally:
         for process in processes:
             process.send_signal(signal.SIGINT)
-    assert [process.wait(60) for process in processes] == [0, 0]
+    assert [process.wait(300) for process in processes] == [0, 0]
 
 
 def test_addresses():

@@ -85,7 +85,7 @@ def strange(usual, tmp_path_factory):
         env=environ,
         stdin=subprocess.DEVNULL,
         capture_output=True,
-        timeout=200,
+        timeout=900,
         check=False,
     )
     return process, cwd / "läuft ü"
