@@ -8,7 +8,7 @@ import numpy as np
 
 from experiment import figures
 from results import measures
-from results.grid import ANYMAL, GO1, METHODS, TABLE_1, TASKS
+from results.grid import ANYMAL, GO1, METHODS, SCALES, TABLE_1, TASKS
 
 WALKING = GO1 + ANYMAL  # tasks that are run at several batches
 MODULES = ("intention_encoder", "history_encoder", "backbone", "action_synthesizer")  # of the actor
@@ -57,7 +57,13 @@ def legend_below(fig, axes, note, columns=4):
 SHADE = "shaded: mean ± one standard deviation over seeds (none where there is one)"
 
 
-def draw_task(ax, task, runs, methods, extra=None):
+def batch(runs):
+    """Environments x steps of a rollout of a task's runs as text, empty if there are none."""
+    settings = next((arm[0]["settings"] for arm in runs.values()), None)
+    return "{num_envs} x {num_steps}".format(**settings) if settings else ""
+
+
+def draw_task(ax, title, runs, methods, extra=None):
     """Curves of a task, the level of 90%, and where each method gets there on average; steps on a second axis."""
     first = next(iter(runs.values()))[0]
     for method in [method for method in methods if method in runs]:
@@ -75,7 +81,7 @@ def draw_task(ax, task, runs, methods, extra=None):
         ax.plot(*extra[1:], color="black", label=extra[0])
     parkour = "progress" in first["columns"]
     seeds_of = measures.seeds(runs, [method for method in methods if method in runs])
-    ax.set(title=f"{TASKS[task]} (n = {seeds_of})", xlabel="PPO iteration", ylim=(0, None))
+    ax.set(title=f"{title} (n = {seeds_of})", xlabel="PPO iteration", ylim=(0, None))
     ax.set_ylabel("curriculum progress" if parkour else "episode return")
     per_iteration = first["columns"]["env_steps"][-1] / first["iteration"][-1] / 1e6
     above = ax.secondary_xaxis("top", functions=(lambda x: x * per_iteration, lambda x: x / per_iteration))
@@ -84,17 +90,17 @@ def draw_task(ax, task, runs, methods, extra=None):
     ax.grid(alpha=0.3)
 
 
-def draw_curves(study, path, methods=TABLE_1, extra=None):
-    """Indicator over iterations, a panel per task. `extra` (label, iteration, value) is on top."""
-    if not study:
+def draw_curves(titled, path, methods=TABLE_1, extra=None):
+    """Indicator over iterations, a panel for each title -> runs. `extra` (label, iteration, value) is on top."""
+    if not titled:
         return False
-    columns = min(len(study), 3)
+    columns = min(len(titled), 3)
     alone = {"width": 8.0, "height": 5.5} if columns == 1 else {}
-    fig, axes = panels(-(-len(study) // columns), columns, **alone)
-    for ax in axes.ravel()[len(study) :]:
+    fig, axes = panels(-(-len(titled) // columns), columns, **alone)
+    for ax in axes.ravel()[len(titled) :]:
         ax.axis("off")
-    for ax, (task, runs) in zip(axes.ravel(), study.items(), strict=False):
-        draw_task(ax, task, runs, methods, extra)
+    for ax, (title, runs) in zip(axes.ravel(), titled.items(), strict=False):
+        draw_task(ax, title, runs, methods, extra)
     dots = "dots: mean iteration at which a run gets there; hollow if some do not, and count by their length"
     legend_below(fig, axes.ravel(), f"{SHADE}\n{dots}", columns=4 if columns > 1 else 3)
     figures.save(fig, path, dpi=80)
@@ -111,7 +117,7 @@ def draw_controls(study, path):
     fig, axes = panels(len(known), 2, 5.2, sharey="row")
     for row, (task, runs) in zip(axes, known.items(), strict=True):
         for ax, methods, weights in zip(row, (left, right), ("PyTorch's", "orthogonal"), strict=True):
-            draw_task(ax, task, runs, [method for method in methods if method in runs])
+            draw_task(ax, TASKS[task], runs, [method for method in methods if method in runs])
             ax.set_title(f"{ax.get_title()}\n{weights} weights", fontsize=10)
     legend_below(fig, axes.ravel(), SHADE, columns=3)
     figures.save(fig, path, dpi=80)
@@ -203,32 +209,66 @@ def draw_sizes(study, path, errors):
     return True
 
 
-def by_batch(loaded, task):
-    """Runs of a task by number of environments, of the scales that have both PIDMs; the later of two with as many."""
-    studies = [
-        study[task] for study in loaded.values() if {"pidm_random", "pidm_pretrained"} <= study.get(task, {}).keys()
-    ]
-    return {runs["pidm_random"][0]["settings"]["num_envs"]: runs for runs in studies}
+def by_scale(loaded, task):
+    """Runs of a task at each scale that has both PIDMs (scale -> runs), the smallest batch first as in grid.py."""
+    return {
+        scale: study[task]
+        for scale, study in loaded.items()
+        if {"pidm_random", "pidm_pretrained"} <= study.get(task, {}).keys()
+    }
+
+
+def curves_by_scale(loaded):
+    """Title -> runs of the walking quadrupeds that were run at several scales."""
+    return {
+        f"{TASKS[task]}, {batch(runs)}{', unscaled' * is_unscaled(scale)}": runs
+        for task in WALKING
+        for scale, runs in by_scale(loaded, task).items()
+        if len(by_scale(loaded, task)) > 1
+    }
+
+
+def is_unscaled(scale):
+    """Whether the first mean actions of the main methods are as PyTorch's weights make them, not almost 0."""
+    return SCALES[scale].weights == "pytorch_unscaled"
+
+
+BATCH_PANELS = ("final", "area", "to 90%")
+
+
+def draw_points(axes, task, scales, colour, marker, side):
+    """A point for each scale, filled ones joined by a line. Returns the numbers of environments."""
+    joined, counts = [], []
+    for scale, runs in scales.items():
+        counts.append(runs["pidm_random"][0]["settings"]["num_envs"])
+        x, unscaled = side * counts[-1], is_unscaled(scale)
+        found = [measures.compare(task, runs, "pidm_pretrained", name) for name in BATCH_PANELS]
+        look = {"color": colour, "mfc": "none" if unscaled else colour}
+        for ax, one in zip(axes, found, strict=True):
+            ax.plot(x, one.value, marker, label=TASKS[task] + ", unscaled first actions" * unscaled, **look)
+            if one.interval:
+                ax.vlines(x, *one.interval, color=colour, lw=1, ls=":" if unscaled else "-")
+        joined += [] if unscaled else [(x, [one.value for one in found])]
+    if joined:
+        x, values = zip(*joined, strict=True)
+        for ax, y in zip(axes, np.transpose(values), strict=True):
+            ax.plot(x, y, color=colour, lw=1)
+    return counts
 
 
 def draw_batch(loaded, path):
     """What pretraining brings over the number of environments (scale -> task -> runs), on the walking quadrupeds."""
-    found = {task: by_batch(loaded, task) for task in WALKING}
-    if max(map(len, found.values())) < 2:
+    fig, (axes,) = panels(1, len(BATCH_PANELS), 3.6)
+    looks = zip(WALKING, ("C0", "C1"), "os", (0.95, 1.05), strict=True)
+    ticks = sorted({count for task, *look in looks for count in draw_points(axes, task, by_scale(loaded, task), *look)})
+    if len(ticks) < 2:
+        figures.pyplot().close(fig)
         return False
-    fig, (axes,) = panels(1, 3, 3.6)
-    for ax, name in zip(axes, ("final", "area", "to 90%"), strict=True):
-        for (task, runs), marker in zip(found.items(), "os", strict=True):
-            estimates = {n: measures.compare(task, runs[n], "pidm_pretrained", name) for n in sorted(runs)}
-            values = [one.value for one in estimates.values()]
-            (line,) = ax.semilogx([*estimates], values, f"{marker}-", label=TASKS[task])
-            ends = [(n, *one.interval) for n, one in estimates.items() if one.interval]
-            ax.vlines(*np.reshape(ends, (-1, 3)).T, color=line.get_color(), lw=1)
+    for ax, name in zip(axes, BATCH_PANELS, strict=True):
         ax.axhline(0.0, color="0.6", lw=1)
-        counts = sorted({n for runs in found.values() for n in runs})
-        ax.set_xticks(counts, counts)
+        ax.set(xlabel="environments", title=measures.MEASURES[name].title, xscale="log")
+        ax.set_xticks(ticks, ticks)
         ax.minorticks_off()
-        ax.set(xlabel="environments", title=measures.MEASURES[name].title)
         ax.grid(alpha=0.3)
     axes[0].set_ylabel("pretrained against random [%]")
     legend_below(fig, axes, "vertical lines: 95% intervals over seeds (none where there is one)")

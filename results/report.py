@@ -156,12 +156,6 @@ def paper_mean(method, name, tasks):
     return f"{np.mean([known[task] for task in tasks]):+.1f}" if known and tasks else ""
 
 
-def batch(runs):
-    """Environments x steps of a rollout of a task's runs as text, empty if there are none."""
-    settings = next((arm[0]["settings"] for arm in runs.values()), None)
-    return "{num_envs} x {num_steps}".format(**settings) if settings else ""
-
-
 def columns_of(names):
     """Title, method and measure of the columns that compare the MLP and the pretrained PIDM in these measures."""
     methods = {"mlp": "MLP", "pidm_pretrained": "pretrained"}
@@ -174,7 +168,7 @@ def table_1(study, tasks=tuple(TASKS)):
     rows = []
     for task in tasks:
         runs = study.get(task, {})
-        row = {"task": TASKS[task], "batch": batch(runs), "seeds": measures.seeds(runs, TABLE_1)}
+        row = {"task": TASKS[task], "batch": drawing.batch(runs), "seeds": measures.seeds(runs, TABLE_1)}
         for i, (head, method, name) in enumerate(columns):
             found = measures.compare(task, runs, method, name)
             row |= {head: shown(found), "paper" + " " * i: paper(method, name, task)}
@@ -262,13 +256,13 @@ def controls(study):
 
 
 def batches_table(loaded):
-    """What pretraining brings at each batch of a walking quadruped, of those with several; and what the MLP does."""
+    """What pretraining brings at each scale of a walking quadruped, of those with several; and what the MLP does."""
     rows = []
     for task in drawing.WALKING:
-        found = drawing.by_batch(loaded, task)
-        for count in sorted(found) if len(found) > 1 else ():
-            runs = found[count]
-            row = {"task": TASKS[task], "batch": batch(runs), "seeds": measures.seeds(runs, TABLE_1)}
+        found = drawing.by_scale(loaded, task)
+        for scale, runs in found.items() if len(found) > 1 else ():
+            row = {"task": TASKS[task], "batch": drawing.batch(runs), "first weights": SCALES[scale].weights}
+            row["seeds"] = measures.seeds(runs, TABLE_1)
             for method in ("pidm_pretrained", "mlp"):
                 title = METHODS[method].title.removeprefix("PIDM ")
                 for name in ("final", "area", "to 50%", "to 90%"):
@@ -344,7 +338,7 @@ def sizes_and_machines(study):
     for task, runs in study.items():
         one = next(iter(runs.values()))[0]
         s, v = one["settings"], one["versions"]
-        size = f"{batch(runs)}, {s['total_steps'] / 1e6:.1f} M steps"
+        size = f"{drawing.batch(runs)}, {s['total_steps'] / 1e6:.1f} M steps"
         lines.append(f"- {TASKS[task]}: `{task}`, {size}, {v['device']}, {v['machine']}")
     return lines
 
@@ -467,22 +461,12 @@ def details(loaded):
     return "\n".join(parts).rstrip() + "\n"
 
 
-def larger(loaded, study):
-    """Runs of the walking quadrupeds at their largest batch, where a study of `pick` has a smaller one."""
-
-    def num_envs(runs):
-        return next(iter(runs.values()))[0]["settings"]["num_envs"]
-
-    found = {task: drawing.by_batch(loaded, task) for task in drawing.WALKING}
-    return {task: runs[max(runs)] for task, runs in found.items() if runs and max(runs) > num_envs(study[task])}
-
-
 def draw_all(loaded):
     """Draw the figures that the runs allow, and remove those that they no longer allow."""
     study = pick(loaded)
     drawn = {
-        "curves": lambda path: drawing.draw_curves(study, path),
-        "curves_larger": lambda path: drawing.draw_curves(larger(loaded, study), path),
+        "curves": lambda path: drawing.draw_curves({TASKS[task]: runs for task, runs in study.items()}, path),
+        "curves_batch": lambda path: drawing.draw_curves(drawing.curves_by_scale(loaded), path),
         "controls": lambda path: drawing.draw_controls(pick(loaded, sum(CONTROLS, ())), path),
         "updates": lambda path: drawing.draw_updates(study, path),
         "success": lambda path: drawing.draw_success(study, path),
@@ -512,9 +496,9 @@ def beside(folder):
     known = [study[task] for study in load_study().values() if task in study]
     if not known:
         raise records.UserError(f"results/study has no runs of {task}")
-    runs = max(known, key=lambda runs: batch(runs) == "{num_envs} x {num_steps}".format(**args))
+    runs = max(known, key=lambda runs: drawing.batch(runs) == "{num_envs} x {num_steps}".format(**args))
     path = folder / "beside_recorded.png"
-    drawing.draw_curves({task: runs}, path, tuple(METHODS), ("this run", *zip(*points, strict=True)))
+    drawing.draw_curves({TASKS[task]: runs}, path, tuple(METHODS), ("this run", *zip(*points, strict=True)))
     print(f"wrote {path}")
 
 

@@ -380,7 +380,7 @@ def test_each_table_takes_the_scale_that_has_most_of_its_methods():
 
 
 def test_what_pretraining_brings_is_drawn_over_the_batch(tmp_path):
-    """Of two scales of 256 environments the later one counts; one batch alone is no figure."""
+    """A row and a panel a scale, those of 256 environments apart by their first weights; one batch is no figure."""
 
     def arms(num_envs, *ends):
         settings = {"settings": {"num_envs": num_envs, "num_steps": 24}}
@@ -388,17 +388,22 @@ def test_what_pretraining_brings_is_drawn_over_the_batch(tmp_path):
         return {"go1_loco": {method: [run | settings for run in runs] for method, runs in both.items()}}
 
     loaded = {"cpu": arms(256, 9.0, 10.0), "256": arms(256, 10.0, 10.0), "batch": arms(4096, 12.0, 13.0)}
-    study = report.pick(loaded, ("pidm_random", "pidm_pretrained"))
-    assert not report.larger(loaded, study)
-    assert report.larger(loaded, loaded["cpu"]) == report.larger(loaded, loaded["256"]) == loaded["batch"]
-    assert not report.larger({"cpu": loaded["cpu"], "256": loaded["256"]}, loaded["cpu"])  # as large, another scale
-    assert drawing.by_batch(loaded, "go1_loco") == {256: loaded["256"]["go1_loco"], 4096: loaded["batch"]["go1_loco"]}
+    loaded["batch"]["anymal_loco"] = {"pidm_random": flat(1.0)}  # not both PIDMs
     assert drawing.draw_batch(loaded, tmp_path / "batch.png") and (tmp_path / "batch.png").stat().st_size > 5000
     _, _, *rows = [re.split(r" ?\| ?", line) for line in report.batches_table(loaded)]
-    assert [(row[2], row[4][:5]) for row in rows] == [("256 x 24", "-4.8 "), ("4096 x 24", "+19.0")]
+    expected = [
+        ("256 x 24", "pytorch_unscaled", "-9.5 "),
+        ("256 x 24", "pytorch", "-4.8 "),
+        ("4096 x 24", "pytorch", "+19.0"),
+    ]
+    assert [(row[2], row[3], row[5][:5]) for row in rows] == expected
+    titled = drawing.curves_by_scale(loaded)
+    assert [*titled] == [f"Go1 locomotion, {x}" for x in ("256 x 24, unscaled", "256 x 24", "4096 x 24")]
+    assert [runs["pidm_pretrained"][0]["indicator"][0] for runs in titled.values()] == [9.0, 10.0, 12.0]
     one_batch = {"cpu": loaded["cpu"], "256": loaded["256"]}
-    assert not drawing.draw_batch(one_batch, tmp_path / "none.png")
-    assert report.batches_table(one_batch) == ["One batch so far."]
+    assert not drawing.draw_batch(one_batch, tmp_path / "none.png") and not (tmp_path / "none.png").exists()
+    assert report.batches_table({"batch": loaded["batch"]}) == ["One batch so far."]
+    assert not drawing.curves_by_scale({"batch": loaded["batch"]})
 
 
 @pytest.fixture
