@@ -277,7 +277,7 @@ def test_only_marked_places_are_filled():
 def recorded(task, method, scale=None):
     """Indicator (K, R) of recorded runs, read from their rows; a reference that shares nothing with the report."""
     curves = []
-    scale = scale or ("batch" if task == "g1_loco" else "cpu")
+    scale = scale or ("batch" if task in ("go1_loco", "g1_loco") else "cpu")
     for path in sorted((report.ROOT / f"results/study/{scale}" / task / method).glob("seed*/metrics.csv")):
         with path.open() as file:
             rows = list(csv.DictReader(file))
@@ -307,7 +307,7 @@ def test_words_of_the_page_are_what_was_recorded():
     last = {m: recorded("anymal_loco", m)[:, -4:].mean(1) for m in ("mlp", "pidm_random", "pidm_pretrained")}
     assert last["pidm_pretrained"].min() > max(last["mlp"].max(), last["pidm_random"].max())
     with_loaded, without = (
-        recorded("go1_loco", f"pidm_{m}_orthogonal")[:, -4:].mean() for m in ("pretrained", "random")
+        recorded("go1_loco", f"pidm_{m}_orthogonal", "cpu")[:, -4:].mean() for m in ("pretrained", "random")
     )
     assert f"costs Go1 {100 * (1 - with_loaded / without):.1f}%" in text
 
