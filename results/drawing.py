@@ -187,24 +187,28 @@ def draw_success(study, path):
 
 
 def draw_sizes(study, path, errors):
-    """Paper Sec. V-D: error of the PIDM (transitions -> rad) and iterations to converge, over its training set."""
+    """Paper Sec. V-D: error of the PIDM (transitions -> rad) and, of tasks that were run with several sizes, iterations
+    to converge, over its training set.
+    """
     if len(errors) < 2:
         return False
     methods = {7_000: "pidm_7k", 70_000: "pidm_70k", 700_000: "pidm_700k", max(errors): "pidm_pretrained"}
-    fig, ((left, right),) = panels(1, 2)
-    left.semilogx(list(errors), list(errors.values()), "o-", color="0.3")
-    left.set(xlabel="transitions", ylabel="mean absolute error [rad]", ylim=(0, None))
-    for k, (task, runs) in enumerate(study.items()):
-        known = {count: measures.compare(task, runs, method, "to 90%") for count, method in methods.items()}
-        known = {count: found.value for count, found in known.items() if found is not None}
-        if len(known) > 1:
-            right.semilogx(list(known), list(known.values()), "os^Dv"[k % 5] + "-", label=TASKS[task])
-    right.set(xlabel="transitions", ylabel="iterations to 90%, against random [%]")
-    right.axhline(0.0, color="0.6", lw=1)
-    for ax in (left, right):
+    found = {
+        task: {count: measures.compare(task, runs, method, "to 90%") for count, method in methods.items()}
+        for task, runs in study.items()
+    }
+    known = {task: {n: one.value for n, one in each.items() if one is not None} for task, each in found.items()}
+    known = {task: each for task, each in known.items() if len(each) > 1}
+    fig, (axes,) = panels(1, 1 + bool(known))
+    axes[0].semilogx(list(errors), list(errors.values()), "o-", color="0.3")
+    axes[0].set(xlabel="transitions", ylabel="mean absolute error [rad]", ylim=(0, None))
+    for (task, each), marker in zip(known.items(), "os^Dv", strict=False):
+        axes[1].semilogx(list(each), list(each.values()), f"{marker}-", label=TASKS[task])
+        axes[1].set(xlabel="transitions", ylabel="iterations to 90%, against random [%]")
+        axes[1].axhline(0.0, color="0.6", lw=1)
+        axes[1].legend(fontsize=8)
+    for ax in axes:
         ax.grid(alpha=0.3)
-    if right.get_legend_handles_labels()[0]:
-        right.legend(fontsize=8)
     figures.save(fig, path, dpi=80)
     return True
 

@@ -223,10 +223,13 @@ def wins(runs, method, name, against="pidm_random"):
     return f"{each.sum():g} of {len(each)}"
 
 
+NOT_RUN = ["Not run yet."]
+
+
 def ablation(study, methods, tasks):
     """Final performance, iterations and seeds on each task; a row for each of `methods` (name -> title), if one ran."""
     if not any(method in study.get(task, {}) for task in tasks for method in methods.keys() - {"pidm_pretrained"}):
-        return ["Not run yet."]
+        return NOT_RUN
     rows = []
     for method, title in methods.items():
         row = {"method": title, "seeds": " / ".join(str(len(study.get(task, {}).get(method, ()))) for task in tasks)}
@@ -372,8 +375,8 @@ def sizes_of(robot):
     folder, found = ROOT / f"results/pidm/{robot}", {}
     for path in [*folder.glob("sizes/*_validation.json"), folder / "validation.json"]:
         stem = path.stem.removesuffix("validation")
-        args = json.loads(path.with_name(f"{stem}args.json").read_text())
-        count = args["num_samples"] or json.loads((folder / "explore/meta.json").read_text())["transitions"]
+        with path.with_name(f"{stem}metrics.csv").open() as file:
+            count = int(float(next(csv.DictReader(file))["samples"]))  # of the first epoch
         found[count] = json.loads(path.read_text())["error_rad"]
     return dict(sorted(found.items()))
 
@@ -424,8 +427,10 @@ def sizes(study, methods, tasks):
     lines, errors = ablation(study, methods, tasks), sizes_of("anymal_d")
     if len(errors) < 2:
         return lines
+    table = [] if lines == NOT_RUN else [*lines, ""]
     line = ", ".join(f"{error:.3f} rad ({count:,})" for count, error in errors.items())
-    return [*lines, "", f"Error by number of transitions: {line}.", "", "![sizes](study/sizes.png)"]
+    line = f"Error by number of transitions: {line}." + " No task was run with the smaller sets yet." * (not table)
+    return [*table, line, "", "![sizes](study/sizes.png)"]
 
 
 def blocks(loaded):

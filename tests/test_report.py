@@ -6,6 +6,7 @@ import re
 import shutil
 import statistics
 
+import matplotlib.image
 import numpy as np
 import pytest
 
@@ -300,7 +301,7 @@ def test_words_of_the_page_are_what_was_recorded():
         there.append(100 * (first[0] / first[1] - 1))
     # The last task is G1's, with a row every four iterations.
     assert f"reaches 50% after {4 * half[0]:.0f} iterations, PIDM random after {4 * half[1]:.0f}" in text
-    assert f"and ends {-ends[-1]:.1f}% lower" in text
+    assert f"and ends {ends[-1]:.1f}% higher, an interval of -4" in text
     assert f"ends {np.mean(ends):.1f}% higher" in text and f"needs {-np.mean(there):.1f}% fewer iterations" in text
     gains = np.array(report.PAPER["to 90%"]["pidm_pretrained"]) < there
     assert gains.sum() == 7 and "seven of nine gains are smaller" in text
@@ -483,22 +484,19 @@ def test_highest_level_reached_stands_where_it_was_recorded(study):
 def test_sizes_are_those_that_were_pretrained_on(tmp_path, monkeypatch):
     monkeypatch.setattr(report, "ROOT", tmp_path)
     folder = tmp_path / "results/pidm/anymal_d"
-    for stem, samples, error in (("sizes/7000_", 7000, 0.9), ("sizes/70000_", 70000, 0.6), ("", None, 0.3)):
-        for name, content in (
-            ("args", {"num_samples": samples}),
-            ("validation", {"error_rad": error, "normalized_error": 2 * error}),
-        ):
-            (folder / f"{stem}{name}.json").parent.mkdir(parents=True, exist_ok=True)
-            (folder / f"{stem}{name}.json").write_text(json.dumps(content))
-    (folder / "explore").mkdir()
-    (folder / "explore/meta.json").write_text('{"transitions": 1000000}')
-    assert report.sizes_of("anymal_d") == {7000: 0.9, 70000: 0.6, 1000000: 0.3}
+    (folder / "sizes").mkdir(parents=True)
+    for stem, samples, error in (("sizes/7000_", 7000, 0.9), ("sizes/70000_", 70000, 0.6), ("", 920000, 0.3)):
+        (folder / f"{stem}validation.json").write_text(json.dumps({"error_rad": error, "normalized_error": 2 * error}))
+        (folder / f"{stem}metrics.csv").write_text(f"iteration,samples\n1.0,{samples}.0\n2.0,{2 * samples}.0\n")
+    assert report.sizes_of("anymal_d") == {7000: 0.9, 70000: 0.6, 920000: 0.3}
     run = {"pidm_random": flat(10.0, 11.0), "pidm_7k": flat(9.0, 9.5), "pidm_pretrained": flat(12.0, 13.0)}
     study = {"anymal_climb_up": run, "anymal_climb_down": run}
     assert drawing.draw_sizes(study, tmp_path / "sizes.png", report.sizes_of("anymal_d"))
-    assert (tmp_path / "sizes.png").stat().st_size > 5000
+    assert drawing.draw_sizes({}, tmp_path / "errors.png", report.sizes_of("anymal_d"))
+    both, errors = (matplotlib.image.imread(tmp_path / f"{name}.png").shape[1] for name in ("sizes", "errors"))
+    assert both == 2 * errors  # no empty panel where no task was run with them
     lines = report.sizes(study, report.titles("sizes"), tuple(study))
-    assert "Error by number of transitions: 0.900 rad (7,000), 0.600 rad (70,000), 0.300 rad (1,000,000)." in lines
+    assert "Error by number of transitions: 0.900 rad (7,000), 0.600 rad (70,000), 0.300 rad (920,000)." in lines
 
 
 def test_live_draws_until_the_run_is_over(tmp_path, capsys):
