@@ -278,6 +278,27 @@ def test_pidm_table_is_what_was_recorded():
         assert f"| {robot} | {' | '.join(figures)} |" in DOCS["pretrain_pidm"].splitlines()
 
 
+def test_large_pidm_is_what_was_recorded():
+    """Errors, features, the returns of walking after as many iterations, and the sizes of the set."""
+    folder = ROOT / "results/pidm_large"
+    page = (folder / "README.md").read_text()
+    compared = read("pidm_large", "compared.json")
+    del compared["weights"]
+    for data, errors in compared.items():
+        assert f"| {data} | {errors['shipped']:.3f} | {errors['large']:.3f} |" in page
+    for at in (50, 100, 150, 200, 250):
+        cells = []
+        for which in ("shipped", "large"):
+            rows = list(csv.DictReader((folder / f"walk_{which}/metrics.csv").read_text().splitlines()))
+            cells += [f"{float(row['episode_return']):.1f}" for row in rows if float(row["iteration"]) == at]
+        assert f"| {at} | {' | '.join(cells)} |" in page
+    size = "features in anymal_loco, root mean square, loaded"
+    assert f"{read('pidm_large', 'features.json')[size]:.1f} ([features.json]" in page
+    sizes = [read("pidm_large/sizes", f"{n}_validation.json") for n in (7000, 70000)]
+    words = [f"{x['error_rad']:.3f}" for x in (*sizes, read("pidm_large", "validation.json"))]
+    assert "{} rad (7 k), {} (70 k) and {} (7 M)".format(*words) in page
+
+
 def test_speed_tables_are_what_was_measured():
     rows = re.findall(r"^\|.*\d{3} \|.*$|^\| .*\| \d.*$", DOCS["speed"], re.M)
     measured = (ROOT / "results/bench/README.md").read_text().splitlines()
