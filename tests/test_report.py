@@ -500,6 +500,8 @@ def test_sizes_are_those_that_were_pretrained_on(tmp_path, monkeypatch):
     assert both == 2 * errors  # no empty panel where no task was run with them
     lines = report.sizes(study, report.titles("sizes"), tuple(study))
     assert "Error by number of transitions: 0.900 rad (7,000), 0.600 rad (70,000), 0.300 rad (920,000)." in lines
+    line, _, figure = report.sizes({}, report.titles("sizes"), tuple(study))
+    assert line.endswith("(920,000). No task was run with the smaller sets yet.") and "sizes.png" in figure
 
 
 def test_live_draws_until_the_run_is_over(tmp_path, capsys):
