@@ -66,6 +66,7 @@ class Args:
     num_minibatches: int = 4
     lr: float = 1e-3
     desired_kl: float = 0.01
+    max_lr: float = 1e-2
     gamma: float = 0.99
     gae_lambda: float = 0.95
     clip: float = 0.2
@@ -426,7 +427,7 @@ def ppo_loss(args, env, net, params, log_std_old, batch, key):
 def adapt_lr(args, lr, kl):
     """rsl_rl's rule: divide the step size by 1.5 where the KL is above twice the target, multiply where below half."""
     lr = jnp.where(kl > 2 * args.desired_kl, jnp.maximum(lr / 1.5, 1e-5), lr)
-    return jnp.where((kl < args.desired_kl / 2) & (kl > 0), jnp.minimum(lr * 1.5, 1e-2), lr)
+    return jnp.where((kl < args.desired_kl / 2) & (kl > 0), jnp.minimum(lr * 1.5, args.max_lr), lr)
 
 
 def clip_gradients(args, grads):

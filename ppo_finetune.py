@@ -3,9 +3,8 @@
     python ppo_finetune.py --task g1_loco --pretrained assets/pidm/g1.msgpack
     python ppo_finetune.py --task go1_loco
 
-Evaluate, film, steer or export the trained policy with play.py.
+Evaluate, film, steer or export the policy with play.py. Differences from rsl_rl are marked `# Deviation (name):`.
 Reads top to bottom: arguments, networks, warm start, rollout, losses, update, training.
-The algorithm follows rsl_rl, a fork of which the paper used. Differences are marked `# Deviation (name):`.
 Shapes: T rollout steps, N environments, B minibatch, O observation, X proprioception x_t, A action, K history, S seeds.
 """
 
@@ -63,11 +62,12 @@ class Args:
     hidden: tuple[int, ...] | None = None  # widths of the MLP's hidden layers
     intention: tuple[int, ...] | None = None  # widths of the intention encoder, without its last layer
     init_std: float | None = None  # initial action std [action units]
-    # --- PPO (rsl_rl) ---
+    # --- PPO, as in rsl_rl, a fork of which the paper used ---
     num_epochs: int = 5  # passes over each rollout
     num_minibatches: int = 4  # B = N * T / num_minibatches
     lr: float = 1e-3  # initial Adam step size, adapted to the KL
     desired_kl: float | None = None  # the step size keeps the KL of a minibatch step within a factor 2 of this
+    max_lr: float = 1e-2  # largest step size; at large batches a deep critic may want less
     gamma: float = 0.99  # discount per control step
     gae_lambda: float = 0.95  # bias/variance trade-off of the advantage
     clip: float = 0.2  # of the probability ratio and of the value
@@ -427,7 +427,7 @@ def ppo_loss(args, env, net, params, log_std_old, batch, key):
 def adapt_lr(args, lr, kl):
     """rsl_rl's rule: divide the step size by 1.5 where the KL is above twice the target, multiply where below half."""
     lr = jnp.where(kl > 2 * args.desired_kl, jnp.maximum(lr / 1.5, 1e-5), lr)
-    return jnp.where((kl < args.desired_kl / 2) & (kl > 0), jnp.minimum(lr * 1.5, 1e-2), lr)
+    return jnp.where((kl < args.desired_kl / 2) & (kl > 0), jnp.minimum(lr * 1.5, args.max_lr), lr)
 
 
 def clip_gradients(args, grads):

@@ -28,7 +28,7 @@ COLOURS = {  # of a method; dashed if only its initial weights differ
 
 def look_of(method):
     """Colour and line of a method, the same in every figure."""
-    base = method.removesuffix("_orthogonal").removesuffix("_unscaled")
+    base = method.removesuffix("_orthogonal").removesuffix("_unscaled").removesuffix("_slow")
     return {"color": COLOURS[base], "linestyle": "-" if base == method else "--"}
 
 

@@ -10,6 +10,7 @@ SHIPPED = "--pretrained assets/pidm/{robot}.msgpack"
 PART = "--pretrained results/pidm/{robot}/sizes"  # made by pidm.py --stages sizes
 PAPER = "--weight-init {weights}"  # as in rsl_rl, a fork of which the paper used
 UNSCALED = "--weight-init pytorch_unscaled"
+SLOW = "--max-lr 0.003"  # rsl_rl: 0.01
 
 
 @dataclass(frozen=True)
@@ -72,6 +73,8 @@ METHODS = {
         f"{SHIPPED} --load-into history_encoder",
     ),
     "pidm_random_unscaled": Method("PIDM random, unscaled", "beyond the paper", f"--network pidm {UNSCALED}"),
+    "pidm_random_slow": Method("PIDM random, small steps", "beyond the paper", f"--network pidm {PAPER} {SLOW}"),
+    "pidm_pretrained_slow": Method("PIDM pretrained, small steps", "beyond the paper", f"{SHIPPED} {PAPER} {SLOW}"),
     "pidm_pretrained_unscaled": Method("PIDM pretrained, unscaled", "beyond the paper", f"{SHIPPED} {UNSCALED}"),
 }
 
@@ -90,6 +93,7 @@ TABLE_1, TABLE_2, PARTS = (tuple(titles(group)) for group in ("table 1", "table 
 PIDMS = ("pidm_random", "pidm_pretrained")
 ORTHOGONAL = ("pidm_random_orthogonal",)
 CONTROLS = (*ORTHOGONAL, "pidm_pretrained_orthogonal", "pidm_shuffled")
+SLOW_PIDMS = ("pidm_random_slow", "pidm_pretrained_slow")
 UNSCALED_PIDMS = ("pidm_random_unscaled", "pidm_pretrained_unscaled")
 
 
@@ -120,6 +124,7 @@ PLAN = (  # in the order in which it is run
     Block("is it knowledge, or the size of the initial weights? ANYmal D", "batch", ANYMAL, CONTROLS, range(1)),
     Block("what pretraining brings, over the batch", "1024", GO1 + ANYMAL, PIDMS, range(2)),
     Block("what first mean actions of almost 0 bring", "batch", GO1, UNSCALED_PIDMS, range(2)),
+    Block("does a smaller largest step size spare the critic?", "batch", GO1 + ANYMAL, SLOW_PIDMS, range(1)),
     Block("Table I: G1 with its gait clock", "batch", G1, TABLE_1, range(3)),
     Block("Table I: parkour where success is to stand", "batch", SKILLS, TABLE_1, range(2)),
     Block("Table II: the actor or the critic alone", "batch", CLIMB_UP + CLIMB_DOWN, TABLE_2, range(1)),

@@ -201,6 +201,11 @@ def test_adaptive_step_size(lr, kl, want):
     assert script.adapt_lr(ARGS, jnp.float32(lr), kl) == pytest.approx(want, rel=1e-5)
 
 
+def test_step_size_has_a_largest_value():
+    args = dataclasses.replace(ARGS, max_lr=3e-3)
+    assert script.adapt_lr(args, jnp.float32(2.5e-3), 1e-4) == pytest.approx(3e-3, rel=1e-5)
+
+
 def test_gradients_are_clipped_apart():
     grads = {
         "params": {"actor": {"w": jnp.array([3.0, 4.0])}, "log_std": jnp.zeros(1), "critic": {"w": jnp.array([0.3])}}
