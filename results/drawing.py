@@ -237,6 +237,38 @@ def is_unscaled(scale):
     return SCALES[scale].weights == "pytorch_unscaled"
 
 
+CRITIC = {"lr": "step size", "critic_grad_norm": "gradient\nof the critic", "explained_variance": "explained\nvariance"}
+
+
+def draw_critics(study, path, first=50):
+    """What becomes of the critics of the walking quadrupeds in the first iterations, a line for each run."""
+    methods = (*TABLE_1, "pidm_random_slow", "pidm_pretrained_slow")
+    tasks = [task for task in WALKING if "pidm_random" in study.get(task, {})]
+    if not tasks:
+        return False
+    fig, axes = panels(len(CRITIC), len(tasks), 5.2, 2.4, sharex=True, sharey="row")
+    for column, task in zip(axes.T, tasks, strict=True):
+        for method in (method for method in methods if method in study[task]):
+            for run in study[task][method]:
+                chosen = run["iteration"] <= first
+                for ax, name in zip(column, CRITIC, strict=True):
+                    label = METHODS[method].title
+                    ax.plot(
+                        run["iteration"][chosen], run["columns"][name][chosen], label=label, lw=1, **look_of(method)
+                    )
+        column[0].set_title(f"{TASKS[task]}, {batch(study[task])}")
+        column[-1].set_xlabel("PPO iteration")
+    for row, (name, title) in zip(axes, CRITIC.items(), strict=True):
+        row[0].set_ylabel(title)
+        for ax in row:
+            ax.grid(alpha=0.3)
+            ax.set_yscale("linear" if name == "explained_variance" else "log")
+    axes[-1, 0].set_ylim(-0.5, 1.0)
+    legend_below(fig, axes.ravel(), "a line for each run", columns=3)
+    figures.save(fig, path, dpi=80)
+    return True
+
+
 BATCH_PANELS = ("final", "area", "to 90%")
 
 

@@ -473,6 +473,7 @@ def draw_all(loaded):
         "curves": lambda path: drawing.draw_curves({TASKS[task]: runs for task, runs in study.items()}, path),
         "curves_batch": lambda path: drawing.draw_curves(drawing.curves_by_scale(loaded), path),
         "controls": lambda path: drawing.draw_controls(pick(loaded, sum(CONTROLS, ())), path),
+        "critics": lambda path: drawing.draw_critics(loaded.get("batch", {}), path),
         "updates": lambda path: drawing.draw_updates(study, path),
         "success": lambda path: drawing.draw_success(study, path),
         "sizes": lambda path: drawing.draw_sizes(pick(loaded, titles("sizes")), path, sizes_of("anymal_d")),
