@@ -8,7 +8,7 @@ import numpy as np
 
 from experiment import figures
 from results import measures
-from results.grid import ANYMAL, GO1, METHODS, SCALES, TABLE_1, TASKS
+from results.grid import ANYMAL, GO1, METHODS, SCALES, SLOW_PIDMS, TABLE_1, TASKS
 
 WALKING = GO1 + ANYMAL  # tasks that are run at several batches
 MODULES = ("intention_encoder", "history_encoder", "backbone", "action_synthesizer")  # of the actor
@@ -240,17 +240,16 @@ def is_unscaled(scale):
 CRITIC = {"lr": "step size", "critic_grad_norm": "gradient\nof the critic", "explained_variance": "explained\nvariance"}
 
 
-def draw_critics(study, path, first=50):
-    """What becomes of the critics of the walking quadrupeds in the first iterations, a line for each run."""
-    methods = (*TABLE_1, "pidm_random_slow", "pidm_pretrained_slow")
+def draw_critics(study, path):
+    """Draw step size and critic of the walking quadrupeds in the first 50 iterations, a line for each run."""
     tasks = [task for task in WALKING if "pidm_random" in study.get(task, {})]
     if not tasks:
         return False
     fig, axes = panels(len(CRITIC), len(tasks), 5.2, 2.4, sharex=True, sharey="row")
     for column, task in zip(axes.T, tasks, strict=True):
-        for method in (method for method in methods if method in study[task]):
-            for run in study[task][method]:
-                chosen = run["iteration"] <= first
+        for method in TABLE_1 + SLOW_PIDMS:
+            for run in study[task].get(method, ()):
+                chosen = run["iteration"] <= 50
                 for ax, name in zip(column, CRITIC, strict=True):
                     label = METHODS[method].title
                     ax.plot(
