@@ -124,7 +124,7 @@ PLAN = (  # in the order in which it is run
     Block("is it knowledge, or the size of the initial weights? ANYmal D", "batch", ANYMAL, CONTROLS, range(1)),
     Block("what pretraining brings, over the batch", "1024", GO1 + ANYMAL, PIDMS, range(2)),
     Block("what first mean actions of almost 0 bring", "batch", GO1, UNSCALED_PIDMS, range(2)),
-    Block("does a smaller largest step size spare the critic?", "batch", GO1 + ANYMAL, SLOW_PIDMS, range(1)),
+    Block("does a smaller largest step size spare the critic?", "batch", GO1 + ANYMAL, SLOW_PIDMS, range(2)),
     Block("Table I: G1 with its gait clock", "batch", G1, TABLE_1, range(3)),
     Block("Table I: parkour where success is to stand", "batch", SKILLS, TABLE_1, range(2)),
     Block("Table II: the actor or the critic alone", "batch", CLIMB_UP + CLIMB_DOWN, TABLE_2, range(1)),

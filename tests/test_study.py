@@ -102,7 +102,7 @@ def test_the_plan_has_the_cells_that_were_asked_for():
     wanted |= {("batch", "go1_loco", method): 3 for method in controls}
     wanted |= {("batch", "go1_loco", f"{method}_unscaled"): 2 for method in main[1:]}
     wanted |= {("batch", "anymal_loco", method): 3 for method in main}
-    wanted |= {("batch", task, f"{m}_slow"): 1 for task in ("go1_loco", "anymal_loco") for m in main[1:]}
+    wanted |= {("batch", task, f"{m}_slow"): 2 for task in ("go1_loco", "anymal_loco") for m in main[1:]}
     wanted |= {("batch", "anymal_loco", method): 1 for method in controls}
     walks = [(scale, task) for scale in ("1024", "256") for task in ("go1_loco", "anymal_loco")]
     wanted |= {(*walk, method): 2 for walk in walks for method in main[1:]}
