@@ -1,6 +1,7 @@
 """Environments are built and compiled once for the whole suite."""
 
 import functools
+import gc
 import os
 import re
 import sys
@@ -11,6 +12,7 @@ FAST_COMPILER = (
     "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true --xla_cpu_use_fusion_emitters=false"
 )
 os.environ.setdefault("XLA_FLAGS", FAST_COMPILER)
+gc.set_threshold(50_000, 20, 50)  # tracing makes many objects, and nearly all of them stay
 
 import jax
 import jax.numpy as jnp

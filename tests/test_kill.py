@@ -25,7 +25,7 @@ from experiment import records, run
 ROOT = Path(__file__).resolve().parent.parent
 KILLS = int(os.environ.get("KILLS", "1"))
 ENDLESS = {
-    "ppo_explore.py": ("--robot", "go1", "--total-steps", "1000000", "--save-minutes", "0"),
+    "ppo_explore.py": ("--robot", "go1", "--total-steps", "1000000", "--ensemble-batch", "64", "--save-minutes", "0"),
     "pretrain_pidm.py": ("--epochs", "100000"),
     "ppo_finetune.py": ("--task", "go1_loco", "--total-steps", "100000000", "--save-minutes", "0"),
 }
@@ -51,7 +51,7 @@ def saved_rows(folder):
 @pytest.fixture(scope="module")
 def data(tmp_path_factory):
     out = tmp_path_factory.mktemp("kill") / "data"
-    ppo_explore.main(ppo_explore.Args(preset="smoke", total_steps=800, run_dir=str(out)))
+    ppo_explore.main(ppo_explore.Args(preset="smoke", total_steps=800, ensemble_batch=64, run_dir=str(out)))
     return out
 
 

@@ -31,8 +31,8 @@ RECORDED = [task for task in envs.TASKS if (ROOT / "results/tasks" / task).exist
 
 # What makes each kind of command small; later words override earlier ones.
 SMALL = {
-    "ppo_explore.py": "--preset smoke --total-steps 800 --force",
-    "pretrain_pidm.py": "--preset smoke --num-samples 32 --force",
+    "ppo_explore.py": "--preset smoke --total-steps 800 --ensemble-batch 64 --force",
+    "pretrain_pidm.py": "--preset smoke --num-samples 32 --epochs 2 --patience 1 --force",
     "ppo_finetune.py": "--preset smoke --num-envs 4 --num-steps 4 --total-steps 32 --force",
     "play.py": "--episodes 2",
     "results/study.py": "--budget-minutes 0",

@@ -50,7 +50,7 @@ def weights_of(path):
 @pytest.fixture(scope="module")
 def collection(tmp_path_factory):
     out = tmp_path_factory.mktemp("resume") / "data"
-    args = ppo_explore.Args(preset="smoke", total_steps=1600, seed=3, run_dir=str(out))
+    args = ppo_explore.Args(preset="smoke", total_steps=1600, ensemble_batch=64, seed=3, run_dir=str(out))
     ppo_explore.main(args)
     return out, args
 
