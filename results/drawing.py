@@ -237,11 +237,16 @@ def is_unscaled(scale):
     return SCALES[scale].weights == "pytorch_unscaled"
 
 
-CRITIC = {"lr": "step size", "critic_grad_norm": "gradient\nof the critic", "explained_variance": "explained\nvariance"}
+CRITIC = {
+    "lr": "step size",
+    "critic_grad_norm": "gradient\nof the critic",
+    "explained_variance": "explained\nvariance",
+    "episode_return": "return",
+}
 
 
 def draw_critics(study, path):
-    """Draw step size and critic of the walking quadrupeds in the first 50 iterations, a line for each run."""
+    """Draw step size, critic and return of the walking quadrupeds in the first 100 iterations, a line for each run."""
     tasks = [task for task in WALKING if "pidm_random" in study.get(task, {})]
     if not tasks:
         return False
@@ -249,7 +254,7 @@ def draw_critics(study, path):
     for column, task in zip(axes.T, tasks, strict=True):
         for method in TABLE_1 + SLOW_PIDMS:
             for run in study[task].get(method, ()):
-                chosen = run["iteration"] <= 50
+                chosen = run["iteration"] <= 100
                 for ax, name in zip(column, CRITIC, strict=True):
                     label = METHODS[method].title
                     ax.plot(
@@ -261,8 +266,8 @@ def draw_critics(study, path):
         row[0].set_ylabel(title)
         for ax in row:
             ax.grid(alpha=0.3)
-            ax.set_yscale("linear" if name == "explained_variance" else "log")
-    axes[-1, 0].set_ylim(-0.5, 1.0)
+            ax.set_yscale("log" if name in ("lr", "critic_grad_norm") else "linear")
+    axes[2, 0].set_ylim(-0.5, 1.0)
     legend_below(fig, axes.ravel(), "a line for each run", columns=3)
     figures.save(fig, path, dpi=80)
     return True

@@ -11,6 +11,7 @@ parkour the curriculum's progress. measures.py has the measures and their statis
 """
 
 import csv
+import itertools
 import json
 import re
 import sys
@@ -26,7 +27,7 @@ sys.path.insert(0, str(ROOT))
 
 from experiment import figures, records
 from results import drawing, measures
-from results.grid import METHODS, SCALES, TABLE_1, TASKS, task_of, titles
+from results.grid import CONTROLS, METHODS, SCALES, TABLE_1, TASKS, task_of, titles
 from results.measures import MEASURES
 
 STUDY = ROOT / "results/study"
@@ -44,7 +45,7 @@ PAPER = {  # measure -> method -> percent against PIDM random by task, in the or
         "pidm_critic": (None, None, None, -1.1, -21.5),
     },
 }
-CONTROLS = (  # method, and the one that it is compared with
+PAIRS = (  # of methods of which one or both are beyond the paper: the second is what the first is compared with
     ("pidm_shuffled", "pidm_random"),
     ("pidm_pretrained", "pidm_shuffled"),
     ("pidm_random_orthogonal", "pidm_random"),
@@ -53,6 +54,8 @@ CONTROLS = (  # method, and the one that it is compared with
     ("pidm_pretrained", "pidm_random_orthogonal"),
     ("mlp_orthogonal", "mlp"),
     ("pidm_pretrained_unscaled", "pidm_random_unscaled"),
+    ("pidm_random_slow", "pidm_random"),
+    ("pidm_pretrained_slow", "pidm_random_slow"),
 )
 
 
@@ -223,13 +226,13 @@ def wins(runs, method, name, against="pidm_random"):
     return f"{each.sum():g} of {len(each)}"
 
 
-NOT_RUN = ["Not run yet."]
-
-
 def ablation(study, methods, tasks):
-    """Final performance, iterations and seeds on each task; a row for each of `methods` (name -> title), if one ran."""
+    """Final performance, iterations and seeds on each task; a row for each of `methods` (name -> title).
+
+    Empty if none of them ran.
+    """
     if not any(method in study.get(task, {}) for task in tasks for method in methods.keys() - {"pidm_pretrained"}):
-        return NOT_RUN
+        return []
     rows = []
     for method, title in methods.items():
         row = {"method": title, "seeds": " / ".join(str(len(study.get(task, {}).get(method, ()))) for task in tasks)}
@@ -243,14 +246,15 @@ def ablation(study, methods, tasks):
     return markdown(without_empty(rows))
 
 
-def controls(study):
+def controls(loaded):
     """Comparisons beyond the paper, on the seeds that both methods have; goals are those of the second one."""
     rows = []
-    for task, runs in study.items():
-        for method, against in CONTROLS:
-            arms = measures.same_seeds(runs, method, against)
-            if arms and {"pidm_shuffled", "pidm_random_orthogonal"} & runs.keys():
-                row = {"task": TASKS[task], "method": METHODS[method].title, "against": METHODS[against].title}
+    for task in TASKS:
+        studies = [study[task] for study in loaded.values() if task in study]
+        for runs, (method, against) in itertools.product(studies, PAIRS):
+            if arms := measures.same_seeds(runs, method, against):
+                row = {"task": TASKS[task], "batch": drawing.batch(runs)}
+                row |= {"method": METHODS[method].title, "against": METHODS[against].title}
                 row["seeds"] = ", ".join(str(run["seed"]) for run in arms[method])
                 for name, title in {"final": "final", "area": "mean of training", "to 90%": "iterations"}.items():
                     row[f"{title} [%]"] = shown(measures.compare(task, arms, method, name, against))
@@ -427,25 +431,32 @@ def sizes(study, methods, tasks):
     lines, errors = ablation(study, methods, tasks), sizes_of("anymal_d")
     if len(errors) < 2:
         return lines
-    table = [] if lines == NOT_RUN else [*lines, ""]
+    table = [*lines, ""] if lines else []
     line = ", ".join(f"{error:.3f} rad ({count:,})" for count, error in errors.items())
     line = f"Error by number of transitions: {line}." + " No task was run with the smaller sets yet." * (not table)
     return [*table, line, "", "![sizes](study/sizes.png)"]
 
 
+def table_2(loaded):
+    """Table II and, below it, the size of the pretraining set; or which methods have not run."""
+    tables, main = [], {"pidm_pretrained": METHODS["pidm_pretrained"].title}
+    for group, table in (("table 2", ablation), ("sizes", sizes)):
+        own = titles(group)
+        lines = table(pick(loaded, own), own | main, ("anymal_climb_up", "anymal_climb_down"))
+        tables += ["", *(lines or [f"Not run yet: {'; '.join(own.values())}."])]
+    return tables[1:]
+
+
 def blocks(loaded):
     """Lines of each marked place, by its name; the unnamed one is in the project's README."""
     study = pick(loaded)
-    climbing = ("anymal_climb_up", "anymal_climb_down")
-    main = {"pidm_pretrained": METHODS["pidm_pretrained"].title}
     return {
         "": readme_table(study),
         "table 1": table_1(study),
         "all tasks": overall(study),
         "along the way": along_the_way(study),
-        "table 2": ablation(pick(loaded, titles("table 2")), titles("table 2") | main, climbing),
-        "sizes": sizes(pick(loaded, titles("sizes")), titles("sizes") | main, climbing),
-        "controls": controls(pick(loaded, sum(CONTROLS, ()))),
+        "table 2": table_2(loaded),
+        "controls": controls(loaded),
         "batch": batches_table(loaded),
         "updates": updates_table(study),
         "accuracy": pidm_table(),
@@ -472,7 +483,7 @@ def draw_all(loaded):
     drawn = {
         "curves": lambda path: drawing.draw_curves({TASKS[task]: runs for task, runs in study.items()}, path),
         "curves_batch": lambda path: drawing.draw_curves(drawing.curves_by_scale(loaded), path),
-        "controls": lambda path: drawing.draw_controls(pick(loaded, sum(CONTROLS, ())), path),
+        "controls": lambda path: drawing.draw_controls(pick(loaded, CONTROLS), path),
         "critics": lambda path: drawing.draw_critics(loaded.get("batch", {}), path),
         "updates": lambda path: drawing.draw_updates(study, path),
         "success": lambda path: drawing.draw_success(study, path),
