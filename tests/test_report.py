@@ -383,7 +383,7 @@ def test_words_on_small_steps_are_what_was_recorded():
         slow, loaded, large = (
             recorded(task, f"pidm_{m}", "batch") for m in ("random_slow", "pretrained_slow", "random")
         )
-        assert len(slow) == len(loaded) == 1, "(n = 1 a robot)"
+        assert len(slow) == len(loaded) == (2 if task == "go1_loco" else 1), "(n = 2 on Go1, 1 on ANYmal D)"
         last = [runs[: len(slow), -7:].mean() for runs in (slow, loaded, large)]
         there = [
             [np.mean([1 + np.argmax(run >= share * last[k]) for run in runs[: len(slow)]]) for runs in arms]
@@ -399,8 +399,8 @@ def test_words_on_small_steps_are_what_was_recorded():
     assert most < 1, "the critic stays whole"
     assert "ends {:.1f}% (Go1) and {:.1f}% (ANYmal D) higher".format(*ends) in text
     assert "after {:.0f}% and {:.0f}% fewer iterations. The pre".format(*fewer) in text
-    assert f"ends {beyond[0]:.1f}% above and {-beyond[1]:.1f}% below that" in text
-    assert f"with {later[0]:.0f}% more iterations on both" in text and f"{later[0]:.0f}" == f"{later[1]:.0f}"
+    assert f"ends {-beyond[0]:.1f}% and {-beyond[1]:.1f}% below that" in text
+    assert 0 < min(later) and max(later) < 1.5 and "with at most 1% more iterations to 90%" in text
     go1, anymal_d = ([f"{x:.0f}" for x in half[i : i + 2]] for i in (0, 2))
     assert f"50% comes after {go1[0]} iterations, not {go1[1]}, on Go1, and for both after {anymal_d[0]} on" in text
     assert anymal_d[0] == anymal_d[1]
