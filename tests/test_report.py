@@ -400,7 +400,7 @@ def test_words_on_small_steps_are_what_was_recorded():
     assert "ends {:.1f}% (Go1) and {:.1f}% (ANYmal D) higher".format(*ends) in text
     assert "after {:.0f}% and {:.0f}% fewer iterations. The pre".format(*fewer) in text
     assert f"ends {-beyond[0]:.1f}% and {-beyond[1]:.1f}% below that" in text
-    assert 0 < min(later) and max(later) < 1.5 and "with at most 1% more iterations to 90%" in text
+    assert min(later) > 0 and max(later) < 1.5 and "with at most 1% more iterations to 90%" in text
     go1, anymal_d = ([f"{x:.0f}" for x in half[i : i + 2]] for i in (0, 2))
     assert f"50% comes after {go1[0]} iterations, not {go1[1]}, on Go1, and for both after {anymal_d[0]} on" in text
     assert anymal_d[0] == anymal_d[1]
