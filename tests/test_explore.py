@@ -5,6 +5,10 @@ import errno
 import json
 import os
 import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -19,8 +23,8 @@ import ppo_explore as script
 import ppo_finetune
 import pretrain_pidm
 from experiment import records
-from experiment.progress import Progress
 
+ROOT = Path(__file__).resolve().parent.parent
 SMOKE = script.Args(preset="smoke", total_steps=400, ensemble_batch=64)
 
 
@@ -284,18 +288,17 @@ def test_full_disk_is_one_line_and_leaves_no_arrays(tmp_path, refused, monkeypat
     assert not list((tmp_path / "run").glob("*.npy"))
 
 
-def test_interrupted_collection_is_unfinished(tmp_path, monkeypatch, capsys):
-    """Ctrl-C after the first of two rows: no meta.json, and stage 2 says why it refuses."""
-    show = Progress.show
-
-    def interrupt(*inputs):
-        show(*inputs)
-        signal.raise_signal(signal.SIGINT)
-
-    monkeypatch.setattr(Progress, "show", interrupt)
-    script.main(dataclasses.replace(SMOKE, total_steps=1600, run_dir=str(tmp_path)))
-    assert "unfinished collection" in capsys.readouterr().out
-    assert len((tmp_path / "metrics.csv").read_text().splitlines()) == 2
+def test_interrupted_collection_is_unfinished(tmp_path, capsys):
+    """Ctrl-C after the first row: exit without a traceback, no meta.json, and stage 2 says why it refuses."""
+    command = [sys.executable, "ppo_explore.py", "--preset", "smoke", "--total-steps", "1000000"]
+    command += ["--ensemble-batch", "64", "--run-dir", str(tmp_path)]
+    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        deadline = time.monotonic() + 600
+        while not (tmp_path / "metrics.csv").exists() and time.monotonic() < deadline:
+            time.sleep(0.2)
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=300)
+    assert process.returncode == 0 and "unfinished collection" in out and "Traceback" not in err, err
     assert not (tmp_path / "meta.json").exists()
     with pytest.raises(SystemExit):
         pretrain_pidm.main(pretrain_pidm.Args(data=str(tmp_path), preset="smoke"))

@@ -32,7 +32,7 @@ RECORDED = [task for task in envs.TASKS if (ROOT / "results/tasks" / task).exist
 # What makes each kind of command small; later words override earlier ones.
 SMALL = {
     "ppo_explore.py": "--preset smoke --total-steps 800 --ensemble-batch 64 --force",
-    "pretrain_pidm.py": "--preset smoke --num-samples 32 --epochs 2 --patience 1 --force",
+    "pretrain_pidm.py": "--preset smoke --num-samples 32 --force",
     "ppo_finetune.py": "--preset smoke --num-envs 4 --num-steps 4 --total-steps 32 --force",
     "play.py": "--episodes 2",
     "results/study.py": "--budget-minutes 0",
@@ -111,6 +111,7 @@ def test_commands_run(command, workplace, quick, monkeypatch, capsys):
         pytest.importorskip(FORMS[word])
     module = importlib.import_module(script.removesuffix(".py").replace("/", "."))
     small = [] if "--eval" in words else SMALL.get(script, "").split()
+    small += ["--epochs", "2", "--patience", "1"] if "--patience" in words else []
     if script == "play.py":
         words += [] if "--set" in words else ["--set"]
         words.insert(words.index("--set") + 1, "episode_seconds=2.0")
