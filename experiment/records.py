@@ -102,7 +102,7 @@ def versions():
     """Commit, device and versions, read once per process."""
     return {
         "commit": commit(),
-        "device": str(jax.devices()[0]),
+        "device": jax.devices()[0].device_kind,
         "machine": f"{platform.machine()}, {cpu_count()} CPUs",
         "python": platform.python_version(),
         "jax": jax.__version__,

@@ -344,9 +344,9 @@ def sizes_and_machines(study):
     lines = []
     for task, runs in study.items():
         one = next(iter(runs.values()))[0]
-        s, v = one["settings"], one["versions"]
-        size = f"{drawing.batch(runs)}, {s['total_steps'] / 1e6:.1f} M steps"
-        lines.append(f"- {TASKS[task]}: `{task}`, {size}, {v['device']}, {v['machine']}")
+        size = f"{drawing.batch(runs)}, {one['settings']['total_steps'] / 1e6:.1f} M steps"
+        machines = sorted({"{device}, {machine}".format(**run["versions"]) for arm in runs.values() for run in arm})
+        lines.append(f"- {TASKS[task]}: `{task}`, {size}, {'; '.join(machines)}")
     return lines
 
 

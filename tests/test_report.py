@@ -9,6 +9,7 @@ import statistics
 import matplotlib.image
 import numpy as np
 import pytest
+from scipy import stats
 
 from experiment import records
 from results import drawing, measures, pidm, report, tasks
@@ -252,6 +253,15 @@ def test_updates_are_of_the_first_iterations_and_also_per_step_size():
     assert table[-1] == "| Go1 locomotion | 1 | -50 | -50 | -50 | -50 | -75 | +100 |"
 
 
+def test_all_machines_of_a_task_are_named():
+    runs = {}
+    for method, device in {"mlp": "NVIDIA H200", "pidm_random": "cpu", "pidm_pretrained": "cpu"}.items():
+        settings = {"num_envs": 2, "num_steps": 5, "total_steps": 3e6}
+        runs[method] = [{"settings": settings, "versions": {"device": device, "machine": "m"}}]
+    (line,) = report.sizes_and_machines({"go1_loco": runs})
+    assert line == "- Go1 locomotion: `go1_loco`, 2 x 5, 3.0 M steps, NVIDIA H200, m; cpu, m"
+
+
 # --- Pages ---
 
 
@@ -309,12 +319,28 @@ def test_words_of_the_page_are_what_was_recorded():
     assert f"ends {np.mean(ends):.1f}% higher" in text and f"needs {-np.mean(there):.1f}% fewer iterations" in text
     gains = np.array(report.PAPER["to 90%"]["pidm_pretrained"]) < there
     assert gains.sum() == 8 and "eight of nine gains are smaller" in text
+    order = stats.spearmanr(there, report.PAPER["to 90%"]["pidm_pretrained"]).statistic
+    assert f"(rank correlation {order:.1f})" in text
     last = {m: recorded("anymal_loco", m, "cpu")[:, -4:].mean(1) for m in ("mlp", "pidm_random", "pidm_pretrained")}
     assert last["pidm_pretrained"].min() > max(last["mlp"].max(), last["pidm_random"].max())
     with_loaded, without = (
         recorded("go1_loco", f"pidm_{m}_orthogonal", "cpu")[:, -4:].mean() for m in ("pretrained", "random")
     )
     assert f"costs Go1 {100 * (1 - with_loaded / without):.1f}%" in text
+
+
+@pytest.mark.parametrize("name", ["README.md", "results/README.md", "docs/ppo_finetune.md"])
+def test_intervals_in_words_stand_in_a_table(name):
+    """The tables are those of README.md and results/README.md."""
+    pages = {page: (report.ROOT / page).read_text() for page in ("README.md", "results/README.md", name)}
+    known = {pair for page in pages.values() for pair in re.findall(r"\[([+-][\d.]+), ([+-][\d.]+)\] \|", page)}
+    found = re.findall(r"interval of ([+-]?[\d.]+) to ([+-]?[\d.]+)%", " ".join(pages[name].split()))
+    assert found or name == "README.md"
+    known = np.array(sorted(known), float)
+    for low, high in found:
+        half = 0.5 * 0.1 ** len(high.partition(".")[2]) + 0.051  # tables are rounded to 0.1, the words once more
+        off = np.abs(known - np.array([low, high], float)).max(-1).min()
+        assert off <= half, f"no table has an interval of {low} to {high}%"
 
 
 def test_words_on_the_batch_are_what_was_recorded():
