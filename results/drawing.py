@@ -254,7 +254,7 @@ def draw_critics(study, path):
     for column, task in zip(axes.T, tasks, strict=True):
         for method in TABLE_1 + SLOW_PIDMS:
             for run in study[task].get(method, ()):
-                chosen = run["iteration"] <= 100
+                chosen = run["iteration"] <= measures.EARLY
                 for ax, name in zip(column, CRITIC, strict=True):
                     label = METHODS[method].title
                     ax.plot(
@@ -267,7 +267,7 @@ def draw_critics(study, path):
         for ax in row:
             ax.grid(alpha=0.3)
             ax.set_yscale("log" if name in ("lr", "critic_grad_norm") else "linear")
-    axes[2, 0].set_ylim(-0.5, 1.0)
+    axes[list(CRITIC).index("explained_variance"), 0].set_ylim(-0.5, 1.0)
     legend_below(fig, axes.ravel(), "a line for each run", columns=3)
     figures.save(fig, path, dpi=80)
     return True
