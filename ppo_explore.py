@@ -99,9 +99,9 @@ def merge(args, ppo):
     values |= {"run_dir": f"runs/explore/{envs.label(args.robot)}/seed{args.seed}"}
     args = records.check_minibatches(records.filled(args, values))
     if not 0 < args.validation < 1 or num_held_out(args) == args.num_envs:
-        raise records.UserError(
-            f"--validation {args.validation} of {args.num_envs} environments leaves training or validation empty"
-        )
+        raise records.UserError(f"--validation {args.validation} of {args.num_envs} environments leaves a split empty")
+    if args.members == 1 and args.policy == "explore":
+        raise records.UserError("--members 1 cannot disagree; choose 2 or more, or --policy random")
     return args
 
 
@@ -110,7 +110,7 @@ def merge(args, ppo):
 
 # >>> copy: mlp (owner: pretrain_pidm.py)
 def dense(width, fan_in, gain, weight_init):
-    """A linear layer: orthogonal weights times gain, no biases; or, as in PyTorch, uniform within 1/sqrt(fan_in)."""
+    """A linear layer: orthogonal weights times gain, zero biases; or, as in PyTorch, uniform within 1/sqrt(fan_in)."""
 
     def pytorch(key, shape, dtype):
         return jax.random.uniform(key, shape, dtype, -1.0, 1.0) / fan_in**0.5
@@ -244,7 +244,7 @@ def statistics(batch):
 
 
 def nll(member, params, norm, batch):
-    """Gaussian negative log-likelihood, without its constant, of each member on a batch of its own (M, B, ...)."""
+    """Gaussian negative log-likelihood, without its constant, of members on batches of their own, (M, B, ...) -> ()."""
 
     def one_member(params, batch):
         mean, log_var = predict(member, jax.tree.map(lambda x: x[None], params), norm, batch)
@@ -441,7 +441,7 @@ def clip_gradients(args, grads):
 
 
 def minibatches(args, key, samples):
-    """Arrays (T, N, ...) -> (M, B, ...): M minibatches, samples shuffled within blocks of environments.
+    """Arrays (T, N, ...) -> (num_minibatches, B, ...), samples shuffled within blocks of environments.
 
     Each minibatch takes an equal share of every block, so that samples stay on the device that collected them.
     """

@@ -3,7 +3,7 @@
     python ppo_finetune.py --task g1_loco --pretrained assets/pidm/g1.msgpack
     python ppo_finetune.py --task go1_loco
 
-Evaluate, film, steer or export the policy with play.py. Differences from rsl_rl are marked `# Deviation (name):`.
+Evaluate, film, steer or export the policy with play.py. docs/deviations.md lists what differs from rsl_rl.
 Reads top to bottom: arguments, networks, warm start, rollout, losses, update, training.
 Shapes: T rollout steps, N environments, B minibatch, O observation, X proprioception x_t, A action, K history, S seeds.
 """
@@ -38,7 +38,7 @@ class Args:
     network: Literal["mlp", "pidm"] | None = None  # of actor and critic; None: pidm with --pretrained, else mlp
     pretrained: str | None = None  # PIDM checkpoint written by pretrain_pidm.py
     policy: str | None = None  # start from actor and critic of this policy.msgpack, e.g. to make it robust
-    load_into: Literal["both", "actor", "critic", "history_encoder", "shuffled"] = "both"  # see `warm_start`
+    load_into: Literal["both", "actor", "critic", "history_encoder", "shuffled", "none"] = "both"  # see `warm_start`
     # Deviation (weight init): rsl_rl has PyTorch's; with orthogonal weights both quadrupeds learn faster.
     weight_init: Literal["orthogonal", "pytorch", "pytorch_unscaled"] = "orthogonal"  # of layers that are not loaded
     preset: Literal["smoke", "cpu", "gpu"] = "cpu"  # scale: 4, 256 or 4096 environments
@@ -60,13 +60,13 @@ class Args:
     total_steps: int | None = None  # environment steps of the whole run
     # --- Network (defaults: the task's) ---
     hidden: tuple[int, ...] | None = None  # widths of the MLP's hidden layers
-    intention: tuple[int, ...] | None = None  # widths of the intention encoder, without its last layer
+    intention: tuple[int, ...] | None = None  # widths of a PIDM's intention encoder, without its last layer
     init_std: float | None = None  # initial action std [action units]
     # --- PPO, as in rsl_rl, a fork of which the paper used ---
     num_epochs: int = 5  # passes over each rollout
     num_minibatches: int = 4  # B = N * T / num_minibatches
     lr: float = 1e-3  # initial Adam step size, adapted to the KL
-    desired_kl: float | None = None  # the step size keeps the KL of a minibatch step within a factor 2 of this
+    desired_kl: float | None = None  # the step size keeps the KL from the rollout's policy within a factor 2 of this
     max_lr: float = 1e-2  # largest step size; at large batches a deep critic may want less
     gamma: float = 0.99  # discount per control step
     gae_lambda: float = 0.95  # bias/variance trade-off of the advantage
@@ -96,8 +96,8 @@ def merge(args, ppo):
     if args.load_into != "both" and not args.pretrained:
         raise records.UserError(f"--load-into {args.load_into} needs --pretrained CHECKPOINT")
     network = args.network or ("pidm" if args.pretrained else "mlp")
-    loaded = "random" if not args.pretrained else "pretrained" if args.load_into == "both" else args.load_into
-    method = "mlp" if network == "mlp" else f"pidm_{loaded}"
+    loaded = {"both": "pretrained", "none": "random"}.get(args.load_into, args.load_into)
+    method = "mlp" if network == "mlp" else f"pidm_{loaded if args.pretrained else 'random'}"
     seed = f"/seed{args.seed}" * (args.num_seeds == 1)
     values = {"network": network, "run_dir": f"runs/{envs.label(args.task, args.robot)}/{method}{seed}"}
     values |= {"hidden": ppo["hidden"], "intention": ppo.get("intention"), "init_std": ppo["init_std"]}
@@ -111,7 +111,7 @@ def merge(args, ppo):
 
 # >>> copy: mlp (owner: pretrain_pidm.py)
 def dense(width, fan_in, gain, weight_init):
-    """A linear layer: orthogonal weights times gain, no biases; or, as in PyTorch, uniform within 1/sqrt(fan_in)."""
+    """A linear layer: orthogonal weights times gain, zero biases; or, as in PyTorch, uniform within 1/sqrt(fan_in)."""
 
     def pytorch(key, shape, dtype):
         return jax.random.uniform(key, shape, dtype, -1.0, 1.0) / fan_in**0.5
@@ -284,18 +284,18 @@ def shuffle_weights(tree, key):
 def warm_start(args, env, params, key):
     """Set a PIDM's input normalisation and, with --pretrained, load history_encoder and backbone (paper Sec. IV-E).
 
-    --load-into chooses the branches; history_encoder loads this part alone. Without --pretrained the normalisation is
-    the robot's shipped one: compared runs differ in weights alone. UserError if made for another robot, x or K.
+    --load-into chooses the branches, none for neither; history_encoder loads this part alone. Without --pretrained the
+    normalisation is the shipped one: compared runs differ in weights alone. UserError if of another robot, x or K.
     """
     path = Path(args.pretrained or SHIPPED / f"{env.robot.name}.msgpack")
     core = {name: params["params"]["actor"][name] for name in ("history_encoder", "backbone")}
     pidm = records.load_pidm(path, env, {"params": core, "normalizer": params["normalizer"]})
     core = jax.tree.map(jnp.asarray, pidm["params"])
     if args.load_into == "shuffled":
-        core = shuffle_weights(core, key)
+        core = shuffle_weights(core, jax.random.fold_in(key, 1))
     if args.load_into == "history_encoder":
         core = {"history_encoder": core["history_encoder"]}
-    branches = (args.load_into,) if args.load_into in ("actor", "critic") else ("actor", "critic")
+    branches = {"actor": ["actor"], "critic": ["critic"], "none": []}.get(args.load_into, ["actor", "critic"])
     loaded = {branch: params["params"][branch] | core for branch in branches if args.pretrained}
     for branch in loaded if not args.resume else ():
         print(f"{branch}: loaded {' and '.join(core)} from {path}")
@@ -441,7 +441,7 @@ def clip_gradients(args, grads):
 
 
 def minibatches(args, key, samples):
-    """Arrays (T, N, ...) -> (M, B, ...): M minibatches, samples shuffled within blocks of environments.
+    """Arrays (T, N, ...) -> (num_minibatches, B, ...), samples shuffled within blocks of environments.
 
     Each minibatch takes an equal share of every block, so that samples stay on the device that collected them.
     """
@@ -513,7 +513,7 @@ def init_state(args, env, net, opt):
     params = net.init(k_net, net.inputs(env_state.obs, env_state.history))
     if args.weight_init == "pytorch":  # orthogonal last layers are small already, pytorch_unscaled keeps PyTorch's
         shrink_first_actions(params)
-    params = warm_start(args, env, params, jax.random.fold_in(key, 1)) if args.network == "pidm" else params
+    params = warm_start(args, env, params, key) if args.network == "pidm" and not args.policy else params
     params = records.load_policy(args.policy, params, env) if args.policy else params
     return TrainState(params, opt.init(params), jnp.float32(args.lr), env_state, key, jnp.zeros((), jnp.int32))
 

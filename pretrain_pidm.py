@@ -53,7 +53,7 @@ class Args:
     epochs: int | None = None  # passes over the data; with --patience at most
     batch: int | None = None  # B
     lr: float = 1e-3  # initial Adam step size; falls to 0 along a cosine
-    patience: int | None = None  # it falls once the error has not fallen for so many epochs, and in as many
+    patience: int | None = None  # lr falls over so many epochs, once as many brought no lower error; None: throughout
     # --- Devices ---
     distributed: bool = False  # this is one of several processes, one per host; process 0 writes the files
 
@@ -81,7 +81,7 @@ def merge(args, robot):
 
 # >>> copy: mlp (owner: pretrain_pidm.py)
 def dense(width, fan_in, gain, weight_init):
-    """A linear layer: orthogonal weights times gain, no biases; or, as in PyTorch, uniform within 1/sqrt(fan_in)."""
+    """A linear layer: orthogonal weights times gain, zero biases; or, as in PyTorch, uniform within 1/sqrt(fan_in)."""
 
     def pytorch(key, shape, dtype):
         return jax.random.uniform(key, shape, dtype, -1.0, 1.0) / fan_in**0.5
@@ -332,8 +332,8 @@ def pretrain(args):
     data, env = open_data(args)
     args = merge(args, env.robot.name)
     count = len(data.train) if args.num_samples is None else args.num_samples
-    if count > len(data.train):
-        raise records.UserError(f"--num-samples {count} is not within 1 and the {len(data.train)} in {args.data}")
+    if not (least := jax.device_count()) <= count <= len(data.train):
+        raise records.UserError(f"--num-samples {count} is not from {least} to the {len(data.train)} in {args.data}")
     index = np.random.default_rng(args.seed).permutation(data.train)[:count]
     few = np.sort(np.random.default_rng(args.seed).permutation(data.validation)[:50_000])
     print(f"{env.robot.name}: {count} transitions to train on, {len(data.validation)} to validate")
@@ -424,7 +424,7 @@ def errors(env, data, outcome):
     action = outcome["action"]
     wrong = np.abs(outcome["predicted"] - action)
     error, error_rad = wrong.mean(), (wrong * np.float32(env.robot.action_scale)).mean()
-    sample = data.windows(np.sort(data.train[:: max(len(data.train) // 20_000, 1)]))["action"]
+    sample = data.windows(data.train[:: max(len(data.train) // 20_000, 1)])["action"]
     return {
         "error": error,  # [action units]
         "error_rad": error_rad,

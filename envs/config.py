@@ -141,7 +141,7 @@ def fits(value, kind):
         return kinds is not None and len(kinds) == len(value) and all(map(fits, value, kinds))
     if kind is float:
         return type(value) in (int, float) and abs(value) < 1e12
-    return type(value) is (origin or kind) and not (kind is int and abs(value) >= 2**31)
+    return type(value) is (origin or kind) and not (kind is int and abs(value) >= 1e12)
 
 
 def alternatives(kind):

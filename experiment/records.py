@@ -161,11 +161,16 @@ def replace_text(path, text):
 
 
 def filled(args, values):
-    """The arguments with fields that are None filled in from `values`; UserError unless all counts are at least 1."""
+    """The arguments with fields that are None filled in from `values`; UserError unless all counts are at least 1.
+
+    --seed may be 0. Numbers are below 1e12, as --resume wants them.
+    """
     args = dataclasses.replace(args, **{name: v for name, v in values.items() if getattr(args, name) is None})
     for name, value in dataclasses.asdict(args).items():
-        if type(value) is int and value < 1 and name != "seed":
-            raise UserError(f"--{name.replace('_', '-')} must be at least 1, not {value}")
+        least = 0 if name == "seed" else 1
+        for number in value if type(value) is tuple else (value,):
+            if type(number) is int and not least <= number < 1e12:
+                raise UserError(f"--{name.replace('_', '-')} must be at least {least}, not {number}, and below 1e12")
     return args
 
 
@@ -278,6 +283,9 @@ def load_pidm(path, env, like):
 
     UserError if it was made for another robot, layout of x or K, or if a part has other shapes.
     """
+    if not path.exists():
+        ways = "--pretrained names one; with --load-into none only its input normalisation is used"
+        raise UserError(f"cannot read PIDM checkpoint {path}: No such file or directory; {ways}")
     content, meta = load(path, "PIDM checkpoint")
     for name, here in (("robot", env.robot.name), ("layout", list(env.prop_layout)), ("history", env.config.history)):
         if meta[name] != here:

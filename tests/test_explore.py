@@ -255,6 +255,7 @@ def test_stages_one_to_three_through_files(collected, tmp_path):
         ({"num_envs": 1}, ["--validation 0.08 of 1 environments"]),
         ({"validation": 0.0}, ["--validation 0.0"]),
         ({"members": 0}, ["--members must be at least 1"]),
+        ({"members": 1}, ["--members 1 cannot disagree", "--policy random"]),
         ({"set": ("rough=2m",)}, ["rough takes a number like 0.5, not '2m'"]),
         ({"set": ("calm=0.5",)}, ["unknown option 'calm'", "rough"]),
         ({"set": ("rough",)}, ["NAME=VALUE", "'rough'"]),

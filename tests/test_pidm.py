@@ -297,6 +297,7 @@ def start(env, task="go1_loco", **changes):
         ("actor", ("actor",), ("history_encoder", "backbone")),
         ("critic", ("critic",), ("history_encoder", "backbone")),
         ("history_encoder", ("actor", "critic"), ("history_encoder",)),
+        ("none", (), ()),
     ],
 )
 def test_warm_start_loads_the_named_parts_and_no_others(pretrained, load_into, branches, parts, jitted, capsys):
@@ -322,6 +323,22 @@ def test_without_a_checkpoint_only_the_input_scaling_is_loaded(jitted, capsys):
     for name in ("prop_mean", "prop_std", "action_mean", "action_std"):
         np.testing.assert_array_equal(warm["normalizer"][name], shipped["normalizer"][name])
     assert "loaded" not in capsys.readouterr().out
+
+
+def test_a_robot_without_a_shipped_checkpoint(pretrained, jitted, tmp_path, monkeypatch):
+    """Its policy goes on as it was; a random PIDM is told where its input scaling can come from."""
+    env, policy = jitted("go1_loco").env, tmp_path / "policy.msgpack"
+    net, _, saved = start(env, pretrained=str(pretrained / "pidm.msgpack"))
+    records.save(policy, saved, {"task": "go1_loco", "args": {}})
+    monkeypatch.setattr(finetune, "SHIPPED", tmp_path)
+    args = finetune.Args(preset="smoke", network="pidm", policy=str(policy))
+    state = finetune.init_state(finetune.merge(args, env.config.ppo), env, net, finetune.optax.scale_by_adam())
+    for part in ("actor", "critic"):
+        jax.tree.map(np.testing.assert_array_equal, state.params["params"][part], saved["params"][part])
+    with pytest.raises(records.UserError, match="--load-into none"):
+        start(env)
+    other = finetune.Args(pretrained=str(pretrained / "pidm.msgpack"), load_into="none")
+    assert finetune.merge(other, env.config.ppo).run_dir == "runs/go1_loco/pidm_random/seed0"
 
 
 def test_shuffled_weights_keep_their_values_and_lose_their_place(pretrained, jitted):
@@ -603,7 +620,7 @@ def test_batches_are_all_of_the_index_in_order(dataset):
         np.testing.assert_array_equal(batch["action"], dataset.windows(np.sort(index[8 * i : 8 * i + 8]))["action"])
 
 
-@pytest.mark.parametrize("load_into", ["actor", "critic", "history_encoder", "shuffled"])
+@pytest.mark.parametrize("load_into", ["actor", "critic", "history_encoder", "shuffled", "none"])
 def test_load_into_without_pretrained_is_refused(load_into, refused):
     args = finetune.Args(preset="smoke", load_into=load_into)
     refused(finetune.main, args, f"--load-into {load_into} needs --pretrained")

@@ -205,6 +205,9 @@ def test_set_from_the_command_line():
         ({"num_envs": 0}, ["--num-envs must be at least 1"]),
         ({"num_minibatches": 5}, ["5 minibatches do not divide", "16"]),
         ({"total_steps": -1}, ["--total-steps must be at least 1"]),
+        ({"total_steps": 10**12}, ["--total-steps must be at least 1", "below 1e12"]),
+        ({"seed": -1}, ["--seed must be at least 0, not -1"]),
+        ({"hidden": (64, 0)}, ["--hidden must be at least 1, not 0"]),
     ],
 )
 def test_bad_arguments_are_refused(changes, words, tmp_path, refused):
