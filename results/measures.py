@@ -1,7 +1,8 @@
 """Measures of recorded runs against PIDM random, and their statistics over seeds and over tasks.
 
-A run is a dict with `indicator` (R,) and `iteration` (R,), one entry a row of metrics.csv. An arm is the list of the
-runs of one method, its seeds. Changes are in percent of PIDM random's arm, the baseline.
+A run is a dict with `indicator` (R,) and `iteration` (R,), one entry a row of metrics.csv, and `errors`, the figures of
+its evaluation. An arm is the list of the runs of one method, its seeds. Changes are in percent of PIDM random's arm,
+the baseline.
 
 Intervals are BCa bootstrap intervals of 95% (Efron 1987; scipy.stats.bootstrap), asked for at a higher level so that
 they are no narrower than Student's: a resample of n seeds has only (n - 1) / n of their variance, and its quantiles are
@@ -32,6 +33,7 @@ class Measure:
 MEASURES = {
     "final": Measure("final performance"),
     "area": Measure("mean of the training"),
+    "mean action": Measure("return of the mean action at the end, without exploration noise"),
     "to 50%": Measure("iterations to 50%", 0.5),
     "to 90%": Measure("iterations to 90%", 0.9),
     "to 90%, smooth": Measure("iterations to 90%, mean of five rows", 0.9, 5),
@@ -75,6 +77,11 @@ def area(run):
     return np.nanmean(run["indicator"])
 
 
+def evaluated(run):
+    """Return of the mean action in the run's evaluation; NaN if it has none, as in tasks with levels."""
+    return run.get("errors", {}).get("episode_return", np.nan)
+
+
 def iterations_to(run, goal, rows=1):
     """First iteration at which the trailing mean of `rows` indicators is at least `goal` (...); NaN if never."""
     rows = min(rows, len(run["indicator"]))
@@ -93,7 +100,7 @@ def values(name, arm, goal):
     measure = MEASURES[name]
     if measure.share is not None:
         return np.stack([iterations_to(run, measure.share * goal, measure.rows) for run in arm], -1)
-    each = np.array([{"final": final, "area": area}[name](run) for run in arm])
+    each = np.array([{"final": final, "area": area, "mean action": evaluated}[name](run) for run in arm])
     return np.broadcast_to(each, (*np.shape(goal), len(arm)))
 
 
@@ -167,10 +174,12 @@ def interval(statistic, samples, *names):
 
 
 def compare(task, runs, method, name, against="pidm_random"):
-    """Estimate of a method's change [%] in one measure on one task (method -> arm); None if one of both was not run."""
+    """Estimate of a method's change [%] in one measure on one task (method -> arm); None if one of both has none."""
     if method not in runs or against not in runs:
         return None
     arm, baseline = runs[method], runs[against]
+    if name == "mean action" and np.isnan([evaluated(run) for run in arm + baseline]).any():
+        return None
     samples = [np.arange(len(one)) for one in (arm, baseline)]
 
     def statistic(i, j, axis=-1):

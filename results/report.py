@@ -58,6 +58,8 @@ PAIRS = (  # of methods of which one or both are beyond the paper: the second is
     ("pidm_pretrained_slow", "pidm_random_slow"),
 )
 
+CONTROLLED = {"final": "final", "mean action": "mean action", "area": "mean of training", "to 90%": "iterations"}
+
 
 @dataclass(frozen=True)
 class Args:
@@ -134,9 +136,9 @@ def without_empty(rows):
     return [{column: row[column] for column in used} for row in rows]
 
 
-def shown(estimate):
+def shown(estimate, none="not run"):
     """An Estimate as text."""
-    return "not run" if estimate is None else str(estimate)
+    return none if estimate is None else str(estimate)
 
 
 def share(estimate):
@@ -212,6 +214,8 @@ def along_the_way(study):
             continue
         row = {"task": TASKS[task]}
         row |= {head: shown(measures.compare(task, runs, method, name)) for head, method, name in columns}
+        for head, method, name in columns_of({"mean action": "mean action"}):
+            row[head] = shown(measures.compare(task, runs, method, name), "")
         for title, name in (("better at the end", "final"), ("sooner at 90%", "to 90%")):
             row[f"pretrained {title}, of seeds"] = wins(runs, "pidm_pretrained", name)
         rows.append(row)
@@ -256,8 +260,8 @@ def controls(loaded):
                 row = {"task": TASKS[task], "batch": drawing.batch(runs)}
                 row |= {"method": METHODS[method].title, "against": METHODS[against].title}
                 row["seeds"] = ", ".join(str(run["seed"]) for run in arms[method])
-                for name, title in {"final": "final", "area": "mean of training", "to 90%": "iterations"}.items():
-                    row[f"{title} [%]"] = shown(measures.compare(task, arms, method, name, against))
+                for name, title in CONTROLLED.items():
+                    row[f"{title} [%]"] = shown(measures.compare(task, arms, method, name, against), "")
                 rows.append(row | {"better at the end, of seeds": wins(arms, method, "final", against)})
     return markdown(rows)
 
@@ -439,12 +443,13 @@ def sizes(study, methods, tasks):
 
 def table_2(loaded):
     """Table II and, below it, the size of the pretraining set; or which methods have not run."""
-    tables, main = [], {"pidm_pretrained": METHODS["pidm_pretrained"].title}
+    tables, missing, main = [], [], {"pidm_pretrained": METHODS["pidm_pretrained"].title}
     for group, table in (("table 2", ablation), ("sizes", sizes)):
         own = titles(group)
         lines = table(pick(loaded, own), own | main, ("anymal_climb_up", "anymal_climb_down"))
-        tables += ["", *(lines or [f"Not run yet: {'; '.join(own.values())}."])]
-    return tables[1:]
+        tables += ["", *lines] if lines else []
+        missing += [] if lines else own.values()
+    return [*tables, *(["", f"Not run yet: {'; '.join(missing)}."] if missing else [])][1:]
 
 
 def blocks(loaded):

@@ -316,6 +316,8 @@ def test_words_of_the_page_are_what_was_recorded():
     means = [np.mean(every[1:7] + every[8:]) for every in (ends, there)]  # without the rows of 4096
     assert "with both quadrupeds' rows of 256 the means are {:+.1f}% and {:+.1f}%".format(*means) in text
     ends, there = ends[:9], there[:9]
+    others = [change for change, task in zip(ends, report.TASKS, strict=True) if task != "anymal_climb_up"]
+    assert f"ours without climbing up {np.mean(others):.1f}%" in text
     assert f"ends {np.mean(ends):.1f}% higher" in text and f"needs {-np.mean(there):.1f}% fewer iterations" in text
     gains = np.array(report.PAPER["to 90%"]["pidm_pretrained"]) < there
     assert gains.sum() == 8 and "eight of nine gains are smaller" in text
@@ -334,7 +336,8 @@ def test_intervals_in_words_stand_in_a_table(name):
     """The tables are those of README.md and results/README.md."""
     pages = {page: (report.ROOT / page).read_text() for page in ("README.md", "results/README.md", name)}
     known = {pair for page in pages.values() for pair in re.findall(r"\[([+-][\d.]+), ([+-][\d.]+)\] \|", page)}
-    found = re.findall(r"interval of ([+-]?[\d.]+) to ([+-]?[\d.]+)%", " ".join(pages[name].split()))
+    words = re.sub(r"(intervals of .*?%) and ", r"\1, interval of ", " ".join(pages[name].split()))
+    found = re.findall(r"intervals? of ([+-]?[\d.]+) to ([+-]?[\d.]+)%", words)
     assert found or name == "README.md"
     known = np.array(sorted(known), float)
     for low, high in found:
@@ -366,6 +369,55 @@ def test_words_on_the_batch_are_what_was_recorded():
     assert "needs {:.0f}% fewer and ANYmal D's {:.0f}%".format(*fewer) in pages[1]
 
 
+def evaluations(scale, task, method):
+    """What the mean action did at the end of each recorded run."""
+    paths = (report.ROOT / "results/study" / scale / task / method).glob("seed*/eval.json")
+    return [json.loads(path.read_text())["task"] for path in sorted(paths)]
+
+
+def test_words_on_noise_are_what_was_recorded():
+    """Returns of mean actions with 4096 environments; those of small steps on the seeds that have them."""
+    text = " ".join((report.ROOT / "results/README.md").read_text().split())
+    methods = ("mlp", "pidm_random", "pidm_pretrained", "pidm_shuffled", "pidm_random_slow", "pidm_pretrained_slow")
+    gains, found = [], {}
+    for task in ("go1_loco", "anymal_loco"):
+        of = {m: np.array([one["episode_return"] for one in evaluations("batch", task, m)]) for m in methods}
+        means = {m: each.mean() for m, each in of.items() if len(each)}  # Go1 has no shuffled weights here
+        mlp, random, loaded, slow, loaded_slow = (means[m] for m in methods if m != "pidm_shuffled")
+        pairs = (loaded, random), (mlp, random), (slow, of["pidm_random"][:2].mean()), (loaded_slow, slow)
+        gains.append([f"{100 * (a / b - 1):.1f}%" for a, b in pairs])
+        found[task] = of
+    go1, anymal_d = gains
+    assert f"return {go1[0]} (Go1) and {anymal_d[0]} (ANYmal D) more than PIDM random's" in text
+    assert f"the MLP's {go1[1]} and {anymal_d[1]}." in text
+    assert f"by {go1[2]} and {anymal_d[2]}, and leave the pretrained one's {go1[3]} and {anymal_d[3]} above" in text
+    best = [found["go1_loco"].pop(m).min() for m in ("pidm_pretrained", "pidm_pretrained_slow")]
+    assert min(best) > max(each.max() for each in found["go1_loco"].values() if len(each)), "above all other runs"
+    lagging = found["anymal_loco"].pop("pidm_random").max()
+    assert lagging < min(each.min() for each in found["anymal_loco"].values()), "only PIDM random lags"
+    stds = {m: [run[-1]["action_std"] for run in runs] for m, runs in rows_of("batch").items() if m in methods}
+    few = [np.mean(stds.pop(m)) for m in ("mlp", "pidm_random_slow")]
+    others = [std for each in stds.values() for std in each]
+    said = "is {:.2f} (MLP), {:.2f} (PIDM random, small steps) or {:.2f} (others)"
+    assert said.format(*few, np.mean(others)) in text
+
+
+def test_words_on_two_tasks_are_what_was_recorded():
+    """Pedipulation's mean action, and ANYmal D's walk with 256 environments and small first actions."""
+    text = " ".join((report.ROOT / "results/README.md").read_text().split())
+    feet, falls = (
+        [np.mean([run[name] for run in evaluations("cpu", "anymal_pedipulation", m)]) for m in methods]
+        for methods in [("pidm_pretrained", "pidm_random")]
+        for name in ("foot_error", "falls")
+    )
+    assert "{:.2f} against {:.2f} m, but it falls in ".format(*feet) in text
+    assert "falls in {:.0f}%, not {:.0f}%".format(*(100 * share for share in falls)) in text
+    random, loaded = (recorded("anymal_loco", f"pidm_{m}", "cpu")[:, -4:].mean(1) for m in ("random", "pretrained"))
+    small = recorded("anymal_loco", "pidm_random", "256")[:1, -4:].mean()
+    assert f"random ends at {small:.1f}, not at {random.min():.1f} to {random.max():.1f}" in text
+    assert f"(pretrained {loaded.min():.1f} to {loaded.max():.1f})" in text
+
+
 def rows_of(scale):
     """Rows of all runs of the walking quadrupeds at a scale, by method, those of Go1 first."""
     found = {}
@@ -390,9 +442,7 @@ def test_words_on_critics_are_what_was_recorded():
     assert f"its gradient jumps to {min(random):.0f} to {max(random):.0f}, and to {others:.1f} at most" in text
     late = sorted(run[29]["explained_variance"] for runs in large.values() for run in runs)[:3]
     shares = [f"{100 * share:.0f}%" for share in late]
-    assert (
-        "explain {} and {} of the variance of returns at iteration 30 (all others {} or more)".format(*shares) in text
-    )
+    assert "explain {} and {} of the variance of returns at iteration 30 (others {} or more)".format(*shares) in text
     worst = [max(found) for found in (random[:3], random[3:])]
     assert [large["pidm_random"][random.index(x)][29]["explained_variance"] for x in worst] == late[:2]
     assert max(row["lr"] for run in large["pidm_pretrained"] for row in run) < 0.008
@@ -409,7 +459,7 @@ def test_words_on_small_steps_are_what_was_recorded():
         slow, loaded, large = (
             recorded(task, f"pidm_{m}", "batch") for m in ("random_slow", "pretrained_slow", "random")
         )
-        assert len(slow) == len(loaded) == (2 if task == "go1_loco" else 1), "(n = 2 on Go1, 1 on ANYmal D)"
+        assert len(slow) == len(loaded) == 2, "(n = 2 each)"
         last = [runs[: len(slow), -7:].mean() for runs in (slow, loaded, large)]
         there = [
             [np.mean([1 + np.argmax(run >= share * last[k]) for run in runs[: len(slow)]]) for runs in arms]
@@ -426,7 +476,7 @@ def test_words_on_small_steps_are_what_was_recorded():
     assert "ends {:.1f}% (Go1) and {:.1f}% (ANYmal D) higher".format(*ends) in text
     assert "after {:.0f}% and {:.0f}% fewer iterations. The pre".format(*fewer) in text
     assert f"ends {-beyond[0]:.1f}% and {-beyond[1]:.1f}% below that" in text
-    assert min(later) > 0 and max(later) < 1.5 and "with at most 1% more iterations to 90%" in text
+    assert min(later) > 0 and max(later) < 2.5 and "with at most 2% more iterations to 90%" in text
     go1, anymal_d = ([f"{x:.0f}" for x in half[i : i + 2]] for i in (0, 2))
     assert f"50% comes after {go1[0]} iterations, not {go1[1]}, on Go1, and for both after {anymal_d[0]} on" in text
     assert anymal_d[0] == anymal_d[1]
