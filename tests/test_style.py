@@ -1,10 +1,12 @@
-"""Checks beyond ruff's: size, dead arguments, long or nested functions, imports that go upwards, deviations."""
+"""Checks beyond ruff's: size, dead arguments, long or nested functions, imports that go upwards, deviations, faults."""
 
 import ast
 import re
 from pathlib import Path
 
 import pytest
+
+from tools import mutants
 
 ROOT = Path(__file__).resolve().parent.parent
 BUDGET = {  # lines, with blanks and docstrings
@@ -124,3 +126,9 @@ def test_every_deviation_is_listed():
     listed = [title.lower() for title in re.findall(r"^\d+\. \*\*(.+?)\.?\*\*", section, re.M)]
     assert len(listed) == len(set(listed)) > 0
     assert {match[1].lower() for match in marked} == set(listed)
+
+
+def test_every_planted_fault_fits_the_code(capsys):
+    """tools/mutants.py finds the text of each once; it ends with exit code 2 where code has been changed since."""
+    mutants.main(mutants.Args(list=True))
+    assert len(capsys.readouterr().out.splitlines()) == sum(map(len, mutants.FAULTS.values()))

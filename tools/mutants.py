@@ -5,7 +5,7 @@
     python tools/mutants.py --list
 
 A fault is a name, a text of its file that occurs once, and what stands there instead. Its tests must pass without it
-and fail with it. Exit code 1 if more than 3 of 60 faults live, 2 if one no longer fits the code.
+and fail with it. Exit code 1 if more than one fault in twenty lives, 2 if one no longer fits the code.
 """
 
 import os
