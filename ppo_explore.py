@@ -53,27 +53,27 @@ class Args:
     # --- Exploration ---
     policy: Literal["explore", "random"] = "explore"  # random: the initial policy throughout, for comparison
     disagreement_coef: float = 2.0  # reward per second of the mean disagreement; must exceed the regularisers' cost
-    members: int = 5  # M
-    buffer_rollouts: int = 8  # R = N * T * buffer_rollouts
+    members: int = 5  # of the ensemble, M
+    buffer_rollouts: int = 8  # that the ring buffer holds: R = N * T * buffer_rollouts
     ensemble_steps: int = 8  # gradient steps per iteration
     ensemble_batch: int = 512  # bootstrap sample of each member and step
-    ensemble_lr: float = 1e-3
+    ensemble_lr: float = 1e-3  # Adam step size of the ensemble
     # --- Network (defaults: the robot's) ---
     hidden: tuple[int, ...] | None = None  # widths of the policy's hidden layers
     init_std: float | None = None  # initial action std [action units]
     # --- PPO (see ppo_finetune.py) ---
-    num_epochs: int = 5
-    num_minibatches: int = 4
-    lr: float = 1e-3
-    desired_kl: float = 0.01
-    max_lr: float = 1e-2
-    gamma: float = 0.99
-    gae_lambda: float = 0.95
-    clip: float = 0.2
-    value_coef: float = 1.0
-    entropy_coef: float | None = None
-    mirror_coef: float = 0.1
-    max_grad_norm: float = 1.0
+    num_epochs: int = 5  # passes over each rollout
+    num_minibatches: int = 4  # B = N * T / num_minibatches
+    lr: float = 1e-3  # initial Adam step size, adapted to the KL
+    desired_kl: float = 0.01  # the step size keeps the KL from the rollout's policy within a factor 2 of this
+    max_lr: float = 1e-2  # largest step size
+    gamma: float = 0.99  # discount per control step
+    gae_lambda: float = 0.95  # bias/variance trade-off of the advantage
+    clip: float = 0.2  # of the probability ratio and of the value
+    value_coef: float = 1.0  # weight of the value loss
+    entropy_coef: float | None = None  # weight of the entropy bonus
+    mirror_coef: float = 0.1  # weight of the mirror loss
+    max_grad_norm: float = 1.0  # of actor and critic, each
     # --- Devices ---
     distributed: bool = False  # this is one of several processes, one per host; process 0 writes the files
     shuffle_blocks: int | None = None  # shuffle samples within this many groups of environments; None: 1 per device
