@@ -97,6 +97,8 @@ def replace_checked(config, overrides):
         except ValueError:
             words = " or ".join(WORDS.get(kind, str(kind)) for kind in alternatives(kinds[name]))
             raise ValueError(f"{name} takes {words}, not {value!r}") from None
+        if kinds[name] == Range and values[name][0] > values[name][1]:
+            raise ValueError(f"{name} takes its lower end first, not {value!r}")
     weights = values.pop("weights", config.weights)
     weights = {term: values.pop(f"weights.{term}", weight) for term, weight in weights.items()}
     return dataclasses.replace(config, weights=weights, **values)

@@ -795,6 +795,7 @@ REFUSALS = [
     ("go1_loco", "friction", "1", "friction takes two numbers like 0.3,1.2, not '1'"),
     ("go1_loco", "friction", "1,2,3", "friction takes two numbers like 0.3,1.2, not '1,2,3'"),
     ("go1_loco", "friction", "0.3,inf", "friction takes two numbers like 0.3,1.2, not '0.3,inf'"),
+    ("go1_loco", "friction", "1.2,0.3", "friction takes its lower end first, not '1.2,0.3'"),
     ("go1_loco", "friction", (1.0,), "friction takes two numbers like 0.3,1.2, not (1.0,)"),
     ("go1_loco", "noise", "", "noise takes a number like 0.5, not ''"),
     ("go1_loco", "noise", "nan", "noise takes a number like 0.5, not 'nan'"),
