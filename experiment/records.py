@@ -22,6 +22,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+import envs
 from envs.config import fits
 from envs.engine import cpu_count
 
@@ -160,17 +161,23 @@ def replace_text(path, text):
     replace_bytes(path, text.encode())
 
 
+ABOVE_0 = ("lr", "max_lr", "ensemble_lr", "desired_kl", "init_std", "clip", "max_grad_norm")  # flags of all scripts
+
+
 def filled(args, values):
     """The arguments with fields that are None filled in from `values`; UserError unless all counts are at least 1.
 
-    --seed may be 0. Numbers are below 1e12, as --resume wants them.
+    --seed is from 0 on, and of 32 bits, for JAX drops the others. Counts are below 1e12, as --resume wants them. Step
+    sizes and stds are above 0.
     """
     args = dataclasses.replace(args, **{name: v for name, v in values.items() if getattr(args, name) is None})
     for name, value in dataclasses.asdict(args).items():
-        least = 0 if name == "seed" else 1
+        flag, (least, most) = f"--{name.replace('_', '-')}", (0, 2**32) if name == "seed" else (1, 10**12)
         for number in value if type(value) is tuple else (value,):
-            if type(number) is int and not least <= number < 1e12:
-                raise UserError(f"--{name.replace('_', '-')} must be at least {least}, not {number}, and below 1e12")
+            if type(number) is int and not least <= number < most:
+                raise UserError(f"{flag} must be at least {least}, not {number}, and below {most}")
+        if name in ABOVE_0 and not value > 0:
+            raise UserError(f"{flag} must be above 0, not {value}")
     return args
 
 
@@ -272,6 +279,9 @@ def load_policy(path, like, env):
     A trained policy has a small std, with which it would hardly explore. UserError also if it is of another body.
     """
     params, meta = load(Path(path), "policy")
+    task = envs.TASKS.get(meta["task"])  # None of a robot from a file, whose body tells it apart
+    if task and task[1].robot != env.robot.name:
+        raise UserError(f"{path} is a policy for robot {task[1].robot}, here is robot {env.robot.name}")
     check_body(path, meta, env)
     check_shapes(path, params, like)
     params = jax.tree.map(jnp.asarray, params)

@@ -205,8 +205,15 @@ def test_set_from_the_command_line():
         ({"num_envs": 0}, ["--num-envs must be at least 1"]),
         ({"num_minibatches": 5}, ["5 minibatches do not divide", "16"]),
         ({"total_steps": -1}, ["--total-steps must be at least 1"]),
-        ({"total_steps": 10**12}, ["--total-steps must be at least 1", "below 1e12"]),
+        ({"total_steps": 10**12}, ["--total-steps must be at least 1", "below 1000000000000"]),
+        (
+            {"task": "anymal_loco", "policy": str(ROOT / "results/tasks/go1_loco/policy.msgpack")},
+            ["is a policy for robot go1, here is robot anymal_d"],
+        ),
         ({"seed": -1}, ["--seed must be at least 0, not -1"]),
+        ({"seed": 2**32}, ["--seed must be at least 0", "below 4294967296"]),
+        ({"lr": -1.0}, ["--lr must be above 0, not -1.0"]),
+        ({"init_std": float("nan")}, ["--init-std must be above 0, not nan"]),
         ({"hidden": (64, 0)}, ["--hidden must be at least 1, not 0"]),
     ],
 )
