@@ -13,7 +13,7 @@ import ppo_finetune
 from envs import loader
 from envs.terrain import flat_scene
 from experiment import records
-from tools import check_robot
+from tools import check_robot, replay
 
 SIDES = {"FL": (0.2, 0.1), "FR": (0.2, -0.1), "RL": (-0.2, 0.1), "RR": (-0.2, -0.1)}
 
@@ -370,7 +370,7 @@ def test_weights_follow_the_body(bodies):
     assert two_feet.gait_hz > 0 == four_feet.gait_hz and two_feet.march > four_feet.march
 
 
-def test_a_run_is_repeatable_without_its_file(write, tmp_path, refused):
+def test_a_run_is_repeatable_without_its_file(write, tmp_path, refused, capsys):
     """args.json holds the body; a checkpoint of another one is refused, in one line."""
     path = write(quadruped())
     args = {"task": "loco", "preset": "smoke", "total_steps": 32, "run_dir": str(tmp_path / "run")}
@@ -385,6 +385,8 @@ def test_a_run_is_repeatable_without_its_file(write, tmp_path, refused):
         robot=str(longer), policy=str(tmp_path / "run/policy.msgpack"), **args | {"run_dir": str(tmp_path / "b")}
     )
     refused(ppo_finetune.main, again, "another body", meta["body"]["digest"])
+    replay.main(replay.Args(str(tmp_path / "run"), iterations=1))
+    assert "nothing failed" in capsys.readouterr().out
 
 
 def test_wrong_pairs_of_flags(refused, write):

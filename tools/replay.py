@@ -55,7 +55,7 @@ def trace(args, env, net, state):
 def find(folder, iterations, robots):
     """Write nan.npz and print what failed. UserError if the folder is no run that can be resumed."""
     args = records.resumed(ppo_finetune.Args(resume=str(folder)))
-    env = make_env(partial(envs.make, robust=args.robust), args.task, args)
+    env = make_env(partial(envs.make, robust=args.robust, robot=args.robot), args.task, args)
     args = ppo_finetune.merge(args, env.config.ppo)
     net, opt = ppo_finetune.make_net(args, env), optax.scale_by_adam()
     like = jax.eval_shape(partial(ppo_finetune.init_state, args, env, net, opt))
@@ -72,7 +72,8 @@ def find(folder, iterations, robots):
             chosen = np.flatnonzero(failed[last])[:robots]
             dump = {name: x[: last + 1, chosen] for name, x in (("qpos", qpos), ("qvel", qvel), ("ctrl", ctrl))}
             path, file = Path(folder) / "nan.npz", io.BytesIO()
-            np.savez(file, **dump, environment=chosen, task=args.task, set=np.array(args.set, str), iteration=now)
+            made = {"task": args.task, "robot": args.robot or "", "set": np.array(args.set, str)}
+            np.savez(file, **dump, **made, environment=chosen, iteration=now)
             records.replace_bytes(path, file.getvalue())
             count = f"{failed[last].sum()} of {args.num_envs}"
             return print(f"iteration {now}, step {last}: {count} environments failed; wrote {path}")
@@ -86,9 +87,9 @@ def repeat(path):
     """Repeat the last step of each dumped robot in plain MuJoCo."""
     try:
         with np.load(path, allow_pickle=False) as file:
-            dump = {name: file[name] for name in ("qpos", "qvel", "ctrl", "environment", "task", "set")}
+            dump = {name: file[name] for name in ("qpos", "qvel", "ctrl", "environment", "task", "robot", "set")}
         args = ppo_finetune.Args(task=str(dump["task"]), engine="c", set=tuple(dump["set"].tolist()))
-        env = make_env(partial(envs.make, robust=args.robust), args.task, args)
+        env = make_env(partial(envs.make, robot=str(dump["robot"]) or None), args.task, args)
         if dump["qpos"].shape[2:] != (env.model.nq,) or dump["ctrl"].shape[2:] != (env.model.nu,):
             raise ValueError("its shapes are not those of its task")
     except Exception as error:  # numpy has no common class for what can be wrong with a file
