@@ -235,6 +235,7 @@ def export_onnx(args):
         "torque_limit": env.model.actuator_forcerange[:, 1].tolist(),  # [N m] of the kp part
         "history": env.config.history,
         "prop": list(env.prop_layout),
+        **({"mjcf": env.config.body["mjcf"]} if env.config.body else {}),  # of a robot from a file
         # of the input `phase`
         **({name: getattr(env.config, name) for name in ("gait_hz", "march")} if "phase" in shapes else {}),
         "versions": records.versions(),

@@ -46,8 +46,8 @@ class Args:
     log_every: int | None = None  # iterations per jitted chunk and CSV row
     tensorboard: bool = False  # write TensorBoard files into the run folder, too
     # --- Data ---
-    num_envs: int | None = None  # N
-    num_steps: int | None = None  # T, per iteration and environment
+    num_envs: int | None = None  # N environments at once
+    num_steps: int | None = None  # T steps of each in an iteration
     total_steps: int | None = None  # transitions to collect
     validation: float = 0.08  # share of environments held out (paper: 600 k of 7.6 M samples)
     # --- Exploration ---
@@ -63,7 +63,7 @@ class Args:
     init_std: float | None = None  # initial action std [action units]
     # --- PPO (see ppo_finetune.py) ---
     num_epochs: int = 5  # passes over each rollout
-    num_minibatches: int = 4  # B = N * T / num_minibatches
+    num_minibatches: int = 4  # of a pass; each has B = N * T / num_minibatches samples
     lr: float = 1e-3  # initial Adam step size, adapted to the KL
     desired_kl: float = 0.01  # the step size keeps the KL from the rollout's policy within a factor 2 of this
     max_lr: float = 1e-2  # largest step size

@@ -55,8 +55,8 @@ class Args:
     log_every: int | None = None  # iterations per jitted chunk and CSV row
     tensorboard: bool = False  # write TensorBoard files into the run folder, too
     # --- Environment ---
-    num_envs: int | None = None  # N
-    num_steps: int | None = None  # T, per iteration and environment
+    num_envs: int | None = None  # N environments at once
+    num_steps: int | None = None  # T steps of each in an iteration
     total_steps: int | None = None  # environment steps of the whole run
     # --- Network (defaults: the task's) ---
     hidden: tuple[int, ...] | None = None  # widths of the MLP's hidden layers
@@ -64,7 +64,7 @@ class Args:
     init_std: float | None = None  # initial action std [action units]
     # --- PPO, as in rsl_rl, a fork of which the paper used ---
     num_epochs: int = 5  # passes over each rollout
-    num_minibatches: int = 4  # B = N * T / num_minibatches
+    num_minibatches: int = 4  # of a pass; each has B = N * T / num_minibatches samples
     lr: float = 1e-3  # initial Adam step size, adapted to the KL
     desired_kl: float | None = None  # the step size keeps the KL from the rollout's policy within a factor 2 of this
     max_lr: float = 1e-2  # largest step size; at large batches a deep critic may want less

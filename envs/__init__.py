@@ -43,9 +43,11 @@ def body_of(robot):
     return robot if isinstance(robot, dict) else loader.load(robot)
 
 
-def label(task_or_robot, robot=None):
-    """Name of a task or robot for folders: a file's is its stem, with the task if there is one."""
-    return f"{Path(robot).stem}_{task_or_robot}" if robot else Path(task_or_robot).stem
+def label(task, robot=None):
+    """Name of a task for folders, after that of the robot if it has a file; or of a robot, by its name or file."""
+    if robot:
+        return f"{label(robot)}_{task}"
+    return loader.name_of(Path(task)) if Path(task).suffix else task
 
 
 def make(task, engine="auto", /, robust=False, robot=None, **overrides):

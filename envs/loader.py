@@ -86,6 +86,11 @@ def load(path):
     return rounded(body | measures(body) | {"digest": digest(body)})
 
 
+def name_of(path):
+    """Name of the robot of a file that `load` takes."""
+    return recorded(path)["name"] if path.suffix == ".json" else read_wishes(path)[0].stem
+
+
 def shipped(path, wishes):
     """The body of a robot whose file already has all that `load` gives to others, and is simulated as it is."""
     spec = reader.read(path)

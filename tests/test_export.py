@@ -1,5 +1,6 @@
 """A policy that leaves JAX acts as before. Tests of the ONNX file itself need requirements-export.txt."""
 
+import shutil
 import sys
 from pathlib import Path
 
@@ -81,6 +82,26 @@ def test_metadata_of_the_file(exported):
     assert facts["task"] == "go1_loco" and len(facts["joints"]) == len(facts["default_pose"]) == 12
     assert facts["action_scale"] == [0.25] * 12 and "gait_hz" not in facts, "no clock, no input of one"
     assert facts["prop"] == list(PROP) and facts["dt"] == 0.02 and "commit" in facts["versions"]
+
+
+def test_a_robot_from_a_file_comes_along(tmp_path):
+    """Its model is in the policy file. An untrained policy holds it in its default pose, feet on the ground."""
+    pytest.importorskip("jax2onnx")
+    pytest.importorskip("onnxruntime")
+    dog = shutil.copy(ROOT / "assets/go1.xml", tmp_path / "dog.xml")
+    (tmp_path / "robot.toml").write_text("pose = { hip = 0.0, thigh = 0.9, calf = -1.8 }")
+    args = {"task": "loco", "robot": str(dog), "preset": "smoke", "total_steps": 32, "run_dir": str(tmp_path / "run")}
+    ppo_finetune.main(ppo_finetune.Args(**args))
+    play.main(play.Args(str(tmp_path / "run/policy.msgpack"), engine="c", export=str(tmp_path / "dog.onnx")))
+    player = play_onnx.Player(tmp_path / "dog.onnx")
+    assert player.facts["robot"] == "dog" and player.model.nu == 12
+    sites = [player.model.site(i).name for i in range(player.model.nsite)]
+    feet = [player.data.site(name).xpos[2] for name in sites if name.endswith("_foot")]
+    assert feet == pytest.approx([0.023] * 4, abs=1e-3), "radius of Go1's feet"
+    height = player.data.qpos[2]
+    _, falls = play_onnx.walk(player, (0.0, 0.0, 0.0), 2.0)
+    assert falls == 0 and player.data.qpos[2] == pytest.approx(height, abs=0.05), "its PD loops give way a little"
+    np.testing.assert_allclose(player.data.qpos[7:], player.pose, atol=0.3)
 
 
 def test_bad_files_are_one_line(tmp_path, capsys):

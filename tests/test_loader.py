@@ -387,6 +387,15 @@ def test_a_run_is_repeatable_without_its_file(write, tmp_path, refused, capsys):
     refused(ppo_finetune.main, again, "another body", meta["body"]["digest"])
     replay.main(replay.Args(str(tmp_path / "run"), iterations=1))
     assert "nothing failed" in capsys.readouterr().out
+    assert envs.label("loco", str(record)) == "dog_loco"
+
+
+def test_folders_have_the_name_of_the_robot(write, tmp_path):
+    """Not that of its robot.toml, which is the same for every robot; one of args.json is tried above."""
+    write(quadruped(), toml='file = "dog.xml"')
+    assert envs.label("loco", str(tmp_path / "robot.toml")) == "dog_loco"
+    assert envs.label(str(tmp_path / "robot.toml")) == envs.label(str(tmp_path / "dog.xml")) == "dog"
+    assert (envs.label("go1_loco"), envs.label("go1")) == ("go1_loco", "go1")
 
 
 def test_wrong_pairs_of_flags(refused, write):

@@ -12,6 +12,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
+import tyro
 from PIL import Image, ImageDraw
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -64,4 +65,4 @@ def main():
 
 if __name__ == "__main__":
     with records.one_line_errors():
-        main()
+        tyro.cli(main, description=__doc__)

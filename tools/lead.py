@@ -12,6 +12,7 @@ from pathlib import Path
 import jax
 import mujoco
 import numpy as np
+import tyro
 from PIL import Image, ImageDraw, ImageFont
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -114,4 +115,4 @@ def main():
 
 if __name__ == "__main__":
     with records.one_line_errors():
-        main()
+        tyro.cli(main, description=__doc__)

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import jax
 import jax.numpy as jnp
+import tyro
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse, FancyArrow, FancyBboxPatch, Rectangle
 
@@ -187,4 +188,4 @@ def main():
 
 if __name__ == "__main__":
     with records.one_line_errors():
-        main()
+        tyro.cli(main, description=__doc__)

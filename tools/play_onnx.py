@@ -67,14 +67,21 @@ class Player:
         self.facts = {name: json.loads(value) for name, value in facts.items()}
         self.pose = np.array(self.facts["default_pose"])
         self.shapes = {given.name: given.shape for given in self.session.get_inputs()}
-        spec = mujoco.MjSpec.from_file(str(ROOT / f"assets/{self.facts['robot']}.xml"))
-        spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 0.1], contype=0, conaffinity=1)
+        spec = self.spec()
+        plane = mujoco.mjtGeom.mjGEOM_PLANE
+        self.ground = spec.worldbody.add_geom(type=plane, size=[0, 0, 0.1], contype=0, conaffinity=1)
         spec.worldbody.add_light(pos=[0, 0, 3])
         self.model = spec.compile()
         self.set_gains()
         self.data = mujoco.MjData(self.model)
         self.decimation = round(self.facts["dt"] / self.model.opt.timestep)
         self.stand()
+
+    def spec(self):
+        """MjSpec of the robot: of assets, or what the policy file holds of a robot that was loaded from a file."""
+        if "mjcf" in self.facts:
+            return mujoco.MjSpec.from_string(self.facts["mjcf"])
+        return mujoco.MjSpec.from_file(str(ROOT / f"assets/{self.facts['robot']}.xml"))
 
     def set_gains(self):
         """Give the motors the gains and limits of the policy file, whatever the MJCF has."""
@@ -91,8 +98,8 @@ class Player:
         mujoco.mj_resetData(m, d)
         d.qpos[:7], d.qpos[7:] = (0, 0, 1, 1, 0, 0, 0), self.pose
         mujoco.mj_kinematics(m, d)
-        solid = [i for i in range(m.ngeom) if m.geom_contype[i] and m.geom_type[i] == mujoco.mjtGeom.mjGEOM_SPHERE]
-        d.qpos[2] -= min(d.geom_xpos[i, 2] - m.geom_size[i, 0] for i in solid)
+        solid, far = np.flatnonzero(m.geom_contype), 10.0
+        d.qpos[2] -= min(mujoco.mj_geomDistance(m, d, self.ground.id, i, far, None) for i in solid)
         mujoco.mj_forward(m, d)
         self.history, self.seconds = None, 0.0
 
