@@ -106,7 +106,10 @@ def evaluate(env, net, params, episodes, level=None):
 def title(env, meta):
     """Level, where the task has some, and method of a policy, for its pictures."""
     trained = meta["args"]
-    kind = "pretrained PIDM" if trained["pretrained"] else {"mlp": "MLP", "pidm": "random PIDM"}[trained["network"]]
+    loaded = trained.get("load_into", "both") if trained["pretrained"] else "none"
+    names = {"both": "pretrained PIDM", "none": "random PIDM", "shuffled": "shuffled PIDM"}
+    pidm = names.get(loaded, f"PIDM, pretrained {loaded.replace('_', ' ')}")
+    kind = "MLP" if trained["network"] == "mlp" else pidm
     return f"level {env.config.level}, {kind}" if env.LEVELS else kind
 
 

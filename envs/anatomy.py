@@ -93,7 +93,7 @@ def feet_of(path, spec, body, shapes, wishes):
         if unknown := [name for name in asked if name not in {model.body(b).name for b in points}]:
             known = ", ".join(model.body(b).name for b in points)
             raise ValueError(f"{path}: no body {unknown[0]!r} with a shape can be a foot; choose from {known}")
-        feet = sorted(model.body(name).id for name in asked)
+        feet = sorted({model.body(name).id for name in asked})
     if len(feet) < 2:
         raise ValueError(f'{path}: only {len(feet)} foot was found; write feet = ["BODY", "BODY"] into robot.toml')
     patches = {b: [point for point in points[b] if point[0][2] - point[1] < lowest[b] + 0.01] for b in feet}
@@ -177,9 +177,9 @@ def mirrors_of(spec, body, notes):
     for name, reflection in REFLECTIONS.items():
         images, error = body_images(model, data, reflection)
         table = images and joint_images(model, data, reflection, images, body)
-        if table:
-            feet = [images[model.body(foot).id] for foot in body["foot_bodies"]]
-            order = [model.body(foot).id for foot in body["foot_bodies"]]
+        order = [model.body(foot).id for foot in body["foot_bodies"]]
+        if table and {images[foot] for foot in order} == {*order}:
+            feet = [images[foot] for foot in order]
             mirrors[name] = table | {"feet": [order.index(foot) for foot in feet]}
             errors[name] = error
     if not mirrors:
@@ -265,10 +265,11 @@ def average(spec, body, notes):
 def average_gains(spec, body, table):
     """Average the motors of mirrored joints, and the angles they hold."""
     perm, signs = table["joints"], np.array(table["signs"])
-    for name in ("kp", "kd", "torque_limit", "action_scale"):
+    for name in ("kp", "kd", "torque_limit", "armature", "action_scale"):
         body[name] = (np.array(body[name]) + np.array(body[name])[perm]) / 2
     body["default_pose"] = (np.array(body["default_pose"]) + signs * np.array(body["default_pose"])[perm]) / 2
     for i, joint in enumerate(body["joints"]):
         limit, motor = body["torque_limit"][i], spec.actuator(joint)
         spec.joint(joint).damping, motor.forcerange = [body["kd"][i], 0, 0], [-limit, limit]
+        spec.joint(joint).armature = body["armature"][i]
         motor.set_to_position(kp=body["kp"][i])

@@ -31,9 +31,12 @@ def simplify(path, spec, notes):
         for geom in filter(None, map(spec.geom, (pair.geomname1, pair.geomname2))):
             geom.contype = 1
     lost = reader.strip(path, spec, {reader.mesh_name(m) for m in spec.meshes if not reader.loadable(spec, m)})
+    lost = with_shapes(spec, lost, notes)
     reader.drop(spec, "excludes", "pairs")
-    fitted = {}
-    for geom in [geom for geom in spec.geoms if geom.meshname]:
+    fitted, meshes = {}, [geom for geom in spec.geoms if geom.meshname]
+    if any(reader.weighs(spec, geom) for geom in meshes):
+        reader.fix_masses(path, spec)
+    for geom in meshes:
         if reader.solid(geom):
             geom.type = GEOM.mjGEOM_BOX  # MuJoCo fits it
             fitted[geom.parent.name] = None
@@ -42,6 +45,15 @@ def simplify(path, spec, notes):
     if fitted:
         notes.append(f"MuJoCo fitted simple shapes to the collision meshes of {', '.join(fitted)}")
     return lost
+
+
+def with_shapes(spec, lost, notes):
+    """Bodies that lost a mesh, but for rigid parts of others that have no shape left, of which a note warns."""
+    shapeless = [name for name in lost if reader.rigid_and_bare(spec.body(name))]
+    if shapeless:
+        names = ", ".join(shapeless)
+        notes.append(f"missing meshes leave no shape for {names}; add a primitive <geom> to what touches the ground")
+    return [name for name in lost if name not in shapeless]
 
 
 def below(model, root):
@@ -163,13 +175,13 @@ def copy_body(model, b, parent, body, is_root):
         if model.jnt_type[j] == JOINT.mjJNT_FREE:
             continue
         name = model.joint(j).name
-        place, dof = body["joints"].index(name), model.jnt_dofadr[j]
+        place = body["joints"].index(name)
         new.add_joint(
             name=name,
             type=JOINT.mjJNT_HINGE,
             **{field: getattr(model, f"jnt_{field}")[j] for field in ("pos", "axis", "range")},
             ref=model.qpos0[model.jnt_qposadr[j]],
-            armature=model.dof_armature[dof],
+            armature=body["armature"][place],
             damping=body["kd"][place],
             stiffness=model.jnt_stiffness[j],
             springref=model.qpos_spring[model.jnt_qposadr[j]],

@@ -112,7 +112,7 @@ class Engine:
             if mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_SENSOR, name) < 0:
                 raise ValueError(f"the robot's MJCF has no sensor {name!r}")
         found = [self.model.sensor(name) for name in names]
-        return np.array([np.arange(s.adr[0], s.adr[0] + s.dim[0]) for s in found])
+        return np.array([np.arange(s.adr[0], s.adr[0] + s.dim[0]) for s in found]) if names else np.zeros((0, 3), int)
 
     def joint_torque(self, qfrc_actuator, qvel):
         """PD torque (nu,) [N m]: the limited kp part, and the kd part that the MJCF holds as joint damping."""

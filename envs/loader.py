@@ -140,6 +140,7 @@ FIELDS = {  # fields of robot.toml -> types; a table has parts of joints' names,
     "kp": (int, float, dict),
     "kd": (int, float, dict),
     "torque_limit": (int, float, dict),
+    "armature": (int, float, dict),
     "action_scale": (int, float, dict),
     "feet": (list,),
     "contact_ends": (list,),
@@ -156,7 +157,10 @@ def sound(value):
 
 
 def read_wishes(path):
-    """Path of the robot's file, and the fields of its robot.toml, which stands beside it or names it as `file`."""
+    """Path of the robot's file, and the fields of its robot.toml, which stands beside it or names it as `file`.
+
+    One beside it that names another file does not count.
+    """
     beside = path.with_name("robot.toml")
     toml = path if path.suffix == ".toml" else beside if beside.exists() else None
     try:
@@ -170,7 +174,9 @@ def read_wishes(path):
             raise ValueError(f"{toml}: {name} cannot be {value!r}")
     if path == toml and "file" not in wishes:
         raise ValueError(f'{toml} names no file; add file = "robot.xml"')
-    return (toml.parent / wishes["file"] if path == toml else path), wishes
+    if path == toml:
+        return toml.parent / wishes["file"], wishes
+    return path, wishes if wishes.get("file", path.name) == path.name else {}
 
 
 def wished(value, joints, otherwise):
@@ -228,6 +234,7 @@ def default_pose(path, model, joints, wishes):
     if len(chosen) == 1:
         qpos = model.key_qpos[keys.index(chosen[0])]
         pose = [float(qpos[model.jnt_qposadr[j]]) for j in joints]
+    refuse_a_tilted_trunk(path, model, joints, qpos if len(chosen) == 1 else model.qpos0)
     names = [model.joint(j).name for j in joints]
     pose = wished(wishes.get("pose"), names, pose)
     if None in pose:
@@ -240,6 +247,19 @@ def default_pose(path, model, joints, wishes):
     if wrong := [n for n, q, a, b in zip(names, pose, low, high, strict=True) if not a - 1e-3 <= q <= b + 1e-3]:
         raise ValueError(f"{path}: the default pose is outside of the limits of {', '.join(wrong)}; change [pose]")
     return np.clip(pose, low, high)
+
+
+def refuse_a_tilted_trunk(path, model, joints, qpos):
+    """ValueError unless the trunk's z axis points up; all that follows takes it to, and its x axis to point forward."""
+    trunk, turn = model.body_rootid[model.jnt_bodyid[joints[0]]], np.zeros(9)
+    first = model.jnt_qposadr[model.body_jntadr[trunk]]
+    mujoco.mju_quat2Mat(turn, qpos[first + 3 : first + 7])
+    if turn[8] < np.cos(np.deg2rad(15)):
+        tilt = np.rad2deg(np.arccos(turn[8]))
+        raise ValueError(
+            f"{path}: {model.body(trunk).name} is tilted by {tilt:.0f} degrees; turn its frame so that z points up and "
+            "x forward, or stand it upright in the keyframe"
+        )
 
 
 def motors_of(path, model, joints, pose, wishes, notes):
@@ -257,7 +277,8 @@ def motors_of(path, model, joints, pose, wishes, notes):
     if None in limits:
         lacking = ", ".join(name for name, limit in zip(names, limits, strict=True) if limit is None)
         raise ValueError(f"{path} gives no torque limit for {lacking}; write torque_limit = 30.0 [N m] into robot.toml")
-    limits, inertia = np.array(limits, float), reflected_inertia(model, joints, pose)
+    limits = np.array(limits, float)
+    armature, inertia = inertias(path, model, joints, driven, pose, wishes, notes)
     gains = np.array([file_gains(model, j, driven.get(j)) for j in joints])  # 0: the file has none
     kp = wished(wishes.get("kp"), names, np.where(gains[:, 0] > 0, gains[:, 0], limits / STIFFNESS))
     kd = np.where(gains[:, 1] > 0, gains[:, 1], 2 * DAMPING * np.sqrt(np.abs(kp) * inertia))
@@ -276,6 +297,7 @@ def motors_of(path, model, joints, pose, wishes, notes):
         "kp": kp,
         "kd": kd,
         "torque_limit": limits,
+        "armature": armature,
         "action_scale": scale,
         "gains_from": source,
         "damping_ratio": kd / (2 * np.sqrt(kp * inertia)),
@@ -295,12 +317,31 @@ def torque_limit(model, joint, actuator):
     return min(found, default=None)
 
 
+def inertias(path, model, joints, driven, pose, wishes, notes):
+    """Rotor inertia of each joint, and with it the whole inertia about it, both (A,) [kg m^2]."""
+    names = [model.joint(j).name for j in joints]
+    own = np.array([rotor(model, j, driven.get(j)) for j in joints])
+    armature = np.array(wished(wishes.get("armature"), names, own), float)
+    if min(armature) < 0:
+        raise ValueError(f"{path}: armature must be 0 or more")
+    if bare := [name for name, one in zip(names, armature, strict=True) if not one]:
+        which = "all joints" if len(bare) == len(names) else ", ".join(bare)
+        notes.append(f"no rotor inertia (armature), which motors have, at {which}; robot.toml can give it")
+    return armature, reflected_inertia(model, joints, pose) - own + armature
+
+
+def rotor(model, joint, actuator):
+    """Rotor inertia [kg m^2] of a joint: the file may have it at the joint or at its motor."""
+    own = 0.0 if actuator is None else model.actuator_armature[actuator] * model.actuator_gear[actuator, 0] ** 2
+    return model.dof_armature[model.jnt_dofadr[joint]] + own
+
+
 def file_gains(model, joint, actuator):
-    """kp and kd of a position actuator, 0 where the file has none. A position actuator's kd may be a joint damping."""
+    """kp and kd of a position actuator, 0 where the file has none. Its kd may be a damping, of the joint or its own."""
     if actuator is None or model.actuator_biasprm[actuator, 1] >= 0:
         return 0.0, 0.0
     square = model.actuator_gear[actuator, 0] ** 2
-    damping = model.dof_damping[model.jnt_dofadr[joint]]
+    damping = model.dof_damping[model.jnt_dofadr[joint]] + model.actuator_damping[actuator] * square
     return -model.actuator_biasprm[actuator, 1] * square, -model.actuator_biasprm[actuator, 2] * square + damping
 
 
@@ -350,7 +391,7 @@ def lines(body):
         yield "{:{wide}}  {:6.3f} {:6.3f} {:7.2f} {:6.2f} {:6.1f} {:6.2f}  {}".format(*row, wide=wide)
     yield "feet: " + ", ".join(body["feet"]) + f"; their sites are {body['sole']:.4f} m above the ground"
     yield f"gait: {', '.join(f'{share:g}' for share in body['gait'])} of a step ahead"
-    yield f"a contact ends an episode: {', '.join(body['contact_ends'])}"
+    yield f"a contact ends an episode: {', '.join(body['contact_ends']) or 'none does, only a tilt'}"
     for mirror, table in body["mirrors"].items():
         joints, images, gaps = body["joints"], table["joints"], body["mirror_errors"][mirror]
         pairs = [

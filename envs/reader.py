@@ -111,6 +111,24 @@ def strip(path, spec, meshes):
     return list(lost)
 
 
+def rigid_and_bare(body):
+    """True for a body without joints, which becomes part of another, that has no collision shape."""
+    return not body.joints and not any(map(solid, body.geoms))
+
+
+def fix_masses(path, spec):
+    """Write the mass and inertia of every body into the spec, so that they stay when meshes become other shapes."""
+    twin = spec.copy()
+    twin.compiler.fusestatic = False
+    model = compiled(path, twin)
+    for body in spec.bodies[1:]:
+        b = model.body(body.name).id
+        body.mass, body.inertia = model.body_mass[b], model.body_inertia[b]
+        body.ipos, body.iquat = model.body_ipos[b], model.body_iquat[b]
+        body.fullinertia, body.explicitinertial = [np.nan] * 6, True
+    spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_FALSE
+
+
 def weighs(spec, geom):
     """True if a geom adds to the mass of the robot."""
     computed = spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE

@@ -144,6 +144,30 @@ def test_robot_toml_goes_before_the_file(write):
     assert body["mirrors"] == {} and any("no symmetry" in note for note in body["notes"])
 
 
+def test_a_robot_toml_of_another_file_does_not_count(write):
+    plain, other = (loader.load(write(quadruped(), toml)) for toml in ("", 'file = "a1.xml"\nkp = 99.0'))
+    assert other == plain
+    assert set(loader.load(write(quadruped(), 'file = "dog.xml"\nkp = 99.0'))["kp"]) == {99.0}
+
+
+def test_rotors_are_those_of_joint_and_motor(write):
+    """A motor's inertia counts with the square of its gear, and robot.toml goes before the file."""
+    text = quadruped().replace('range="-0.8 0.8"', 'range="-0.8 0.8" armature="0.01"')
+    text = text.replace('joint="FL_hip" ctrlrange="-20 20"', 'joint="FL_hip" ctrlrange="-4 4" gear="5" armature="2e-3"')
+    body = loader.load(write(text, "armature = { thigh = 0.03 }"))
+    model = mujoco.MjModel.from_xml_string(body["mjcf"])
+    np.testing.assert_allclose(model.dof_armature[6:], [0.06, 0.03, 0, *[0.01, 0.03, 0] * 3])
+    assert body["kp"][0] == body["kp"][3] and "at FL_calf, FR_calf, RL_calf, RR_calf;" in " ".join(body["notes"])
+    knee = 1e-3 + 0.2 * 0.1**2
+    heavy = loader.load(write(quadruped(), "armature = 0.02"))
+    np.testing.assert_allclose(heavy["kd"][2], 2 * 0.5 * np.sqrt(20 * (knee + 0.02)), rtol=1e-6)
+
+
+def test_a_foot_without_an_image_leaves_no_mirror(write):
+    body = loader.load(write(quadruped(), 'feet = ["FL_calf", "FR_calf", "RL_calf", "FL_calf"]'))
+    assert body["foot_bodies"] == ["FL_calf", "FR_calf", "RL_calf"] and not body["mirrors"]
+
+
 def test_masses_are_averaged_on_request(write):
     """A calf that is 3 % too heavy spoils the mirror image; averaging mends it and keeps the mass."""
     legs = "".join(leg(n, x, y, mass=0.206 if n == "FL" else 0.2) for n, (x, y) in SIDES.items())
@@ -224,6 +248,29 @@ def test_a_mesh_that_is_there_becomes_a_fitted_shape(write, tmp_path):
     assert any("collision meshes of trunk" in note for note in body["notes"])
 
 
+def test_a_body_that_weighs_its_mesh_keeps_its_mass(write, tmp_path):
+    """Half of a cube of 0.2 m, cut along a diagonal: 4 kg at 1000 kg/m3, and its centre is that of a triangle."""
+    corners = [(x, y, z) for y in (-0.1, 0.1) for x, z in ((-0.1, -0.1), (0.1, -0.1), (-0.1, 0.1))]
+    faces = "f 1 2 3\nf 4 6 5\nf 1 4 5\nf 1 5 2\nf 2 5 6\nf 2 6 3\nf 3 6 4\nf 3 4 1\n"
+    (tmp_path / "wedge.obj").write_text("".join("v {} {} {}\n".format(*c) for c in corners) + faces)
+    text = quadruped().replace('<inertial pos="0 0 0" mass="6" diaginertia="0.02 0.06 0.07"/>', "")
+    text = text.replace('<geom name="trunk" type="box" size="0.2 0.08 0.05"/>', '<geom type="mesh" mesh="wedge"/>')
+    body = loader.load(write(text.replace("<worldbody>", '<asset><mesh file="wedge.obj"/></asset><worldbody>')))
+    np.testing.assert_allclose(body["base_mass"], 4.0, rtol=1e-3)
+    model = mujoco.MjModel.from_xml_string(body["mjcf"])
+    np.testing.assert_allclose(model.body_ipos[1], [-0.1 / 3, 0, -0.1 / 3], atol=1e-3)
+    np.testing.assert_allclose(body["mass"], 4.0 + 4 * 1.5, rtol=1e-3)
+
+
+def test_a_rigid_foot_that_lost_its_mesh_is_named(write):
+    """It becomes part of the calf, whose own shapes would otherwise stand in without a word."""
+    foot = '<body name="{0}_pad" pos="0 0 -0.2"><geom type="mesh" mesh="part" mass="0"/></body>'
+    text = quadruped().replace('<geom name="FL_toe" type="sphere" size="0.02" pos="0 0 -0.2"/>', foot.format("FL"))
+    text = text.replace("<worldbody>", '<asset><mesh name="part" file="part.stl"/></asset><worldbody>')
+    (note,) = [note for note in loader.load(write(text))["notes"] if "missing" in note]
+    assert "no shape for FL_pad; add a primitive" in note
+
+
 CUBE = "f 1 2 4\nf 1 4 3\nf 5 8 6\nf 5 7 8\nf 1 5 6\nf 1 6 2\nf 3 4 8\nf 3 8 7\nf 1 3 7\nf 1 7 5\nf 2 6 8\nf 2 8 4\n"
 
 
@@ -277,6 +324,11 @@ REFUSED = {
     "an idle joint": (quadruped(more=motors(("FL", "FR", "RL"))), "RR_hip", "no actuator"),
     "no torque limit": (quadruped(more=motors().replace('ctrlrange="-20 20"', "")), "torque_limit ="),
     "a pose beyond the limits": (quadruped(), "limits of FL_calf"),
+    "a trunk on its side": (
+        quadruped().replace('qpos="0 0 0.3 1 0 0 0', 'qpos="0 0 0.3 1 1 0 0'),
+        "trunk is tilted by 90 degrees",
+        "z points up",
+    ),
 }
 TOMLS = {"a pose beyond the limits": "pose = { FL_calf = 1.0 }"}
 
@@ -357,6 +409,13 @@ def test_a_dog_walks_through_its_task(bodies):
     assert env.motion(state.physics).foot_contact.all()
     image = env.mirror("left_right", "obs", state.obs)
     np.testing.assert_array_equal(env.mirror("left_right", "obs", image), state.obs)
+
+
+def test_without_contact_ends_only_a_tilt_ends_an_episode(write):
+    body = loader.load(write(quadruped(), "contact_ends = []"))
+    env = envs.make("loco", "c", robot=body)
+    state = jax.jit(env.reset)(jax.random.key(0))
+    assert not jax.jit(env.step)(state, jnp.zeros(12)).terminated and "only a tilt" in "\n".join(loader.lines(body))
 
 
 def test_weights_follow_the_body(bodies):

@@ -4,8 +4,10 @@ import csv
 
 import jax
 import numpy as np
+import optax
 import pytest
 
+import envs
 import ppo_finetune
 from experiment import records
 from tools import replay
@@ -36,6 +38,20 @@ def test_a_robot_that_fails_is_found_and_dumped(run, capsys):
     replay.main(replay.Args(str(out / "nan.npz")))
     out = capsys.readouterr().out
     assert "environment 2: " in out and out.count("physics step") == 5, "it has the config of the run"
+
+
+def test_targets_of_a_dump_are_those_of_the_delayed_actions():
+    """All robots act one control step late: the second target is that of the first action."""
+    args = ppo_finetune.Args(preset="smoke", engine="c", set=("action_delay=0.02,0.02",))
+    env = envs.make(args.task, "c", action_delay=(0.02, 0.02))
+    args = ppo_finetune.merge(args, env.config.ppo)
+    net, opt = ppo_finetune.make_net(args, env), optax.scale_by_adam()
+    state = ppo_finetune.init_state(args, env, net, opt)
+    targets = jax.jit(lambda s: replay.trace(args, env, net, s))(state)[2]
+    k_roll, _ = jax.random.split(jax.random.fold_in(state.key, state.iteration))
+    roll = jax.jit(lambda s: ppo_finetune.rollout(args, env, net, s.params, s.env, k_roll))(state)[1]
+    np.testing.assert_allclose(targets[0], np.tile(env.default_pose, (4, 1)))
+    np.testing.assert_allclose(targets[1], env.default_pose + env.action_scale * roll.action[0], atol=1e-6)
 
 
 def test_weights_that_are_not_finite_stop_the_run_and_keep_the_last_good_state(tmp_path, refused, capsys):

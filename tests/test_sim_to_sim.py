@@ -175,6 +175,15 @@ def test_armature_is_lent_to_joints_that_have_none(tmp_path, ours):
     assert not np.allclose(robot.model.dof_invweight0, before), "MuJoCo's constants follow"
 
 
+def test_rotors_at_the_motors_stay(tmp_path, ours):
+    spec = mujoco.MjSpec.from_string(GO1.mjcf)
+    for motor in spec.actuators:
+        motor.armature, motor.gear[0] = 1e-3, 2.0
+    (tmp_path / "dog.xml").write_text(spec.to_xml())
+    robot = sim_to_sim.load_robot(tmp_path / "dog.xml", FACTS)
+    np.testing.assert_allclose(robot.model.dof_armature[robot.qvel], ours.model.dof_armature[ours.qvel] + 4e-3)
+
+
 def test_bodies_have_their_limits(ours):
     body = ours.body(FACTS)
     np.testing.assert_allclose(body.low[:3], [-0.863, -0.686, -2.818])
@@ -423,7 +432,8 @@ def test_policies_of_locomotion_are_welcome_if_complete():
         ({}, WIDTHS, "lacks robot, dt"),
         (FACTS, WIDTHS | {"phase": 2}, "lacks gait_hz"),
         (FACTS, {"gravity": 3}, "takes no command"),
-        (FACTS | {"robot": "spot"}, WIDTHS, "'spot'; known are"),
+        (FACTS | {"robot": "spot"}, WIDTHS, "'spot' of a file; known are"),
+        (FACTS | {"mjcf": "<mujoco/>"}, WIDTHS, "'go1' of a file; known are"),
     ):
         with pytest.raises(sim_to_sim.records.UserError, match=words):
             sim_to_sim.check_policy("x.onnx", facts, shapes)

@@ -144,6 +144,8 @@ class Player:
 
 def watch(player, command):
     """Show the robot in a window and take its command from the keys, until it is closed."""
+    if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        fail("--viewer needs a display; leave it out to print how the robot moved")
     import mujoco.viewer
 
     wanted = np.array(command, float)
@@ -181,6 +183,8 @@ def fail(text):
 
 
 def main(args):
+    if not 0.1 <= args.seconds <= 3600:
+        fail(f"--seconds must be from 0.1 to 3600, not {args.seconds}")
     try:
         player = Player(args.policy)
     except ImportError:

@@ -6,7 +6,8 @@
 The first command repeats the training, bit for bit on engine c, up to the first rollout with a number that is not
 finite or a simulation that diverged. nan.npz holds these environments up to that step: qpos, qvel (steps, environments,
 ...) before each control step, the joint targets `ctrl`, and the environments' numbers. If no robot failed, it was the
-update of the weights. The second command steps the dumped robots in plain MuJoCo.
+update of the weights. The second command steps the dumped robots in plain MuJoCo, with the masses and the friction of
+their file: those of the episodes are not in the dump.
 """
 
 import io
@@ -46,7 +47,7 @@ def trace(args, env, net, state):
     def step(before, action):
         after = jax.vmap(env.step)(before, action)
         sound = jnp.isfinite(after.reward) & jnp.isfinite(action).all(-1) & jnp.isfinite(after.final_obs).all(-1)
-        physics, target = before.physics, env.default_pose + env.action_scale * action
+        physics, target = before.physics, jax.vmap(env.joint_targets)(before, action)
         return after, (physics.qpos, physics.qvel, target, ~sound | after.metrics["diverged"])
 
     return jax.lax.scan(step, state.env, roll.action)[1]
@@ -72,7 +73,7 @@ def find(folder, iterations, robots):
             chosen = np.flatnonzero(failed[last])[:robots]
             dump = {name: x[: last + 1, chosen] for name, x in (("qpos", qpos), ("qvel", qvel), ("ctrl", ctrl))}
             path, file = Path(folder) / "nan.npz", io.BytesIO()
-            made = {"task": args.task, "robot": args.robot or "", "set": np.array(args.set, str)}
+            made = {"task": args.task, "robot": args.robot or "", "robust": args.robust, "set": np.array(args.set, str)}
             np.savez(file, **dump, **made, environment=chosen, iteration=now)
             records.replace_bytes(path, file.getvalue())
             count = f"{failed[last].sum()} of {args.num_envs}"
@@ -87,9 +88,11 @@ def repeat(path):
     """Repeat the last step of each dumped robot in plain MuJoCo."""
     try:
         with np.load(path, allow_pickle=False) as file:
-            dump = {name: file[name] for name in ("qpos", "qvel", "ctrl", "environment", "task", "robot", "set")}
+            names = ("qpos", "qvel", "ctrl", "environment", "task", "robot", "robust", "set")
+            dump = {name: file[name] for name in names}
         args = ppo_finetune.Args(task=str(dump["task"]), engine="c", set=tuple(dump["set"].tolist()))
-        env = make_env(partial(envs.make, robot=str(dump["robot"]) or None), args.task, args)
+        make = partial(envs.make, robust=bool(dump["robust"]), robot=str(dump["robot"]) or None)
+        env = make_env(make, args.task, args)
         if dump["qpos"].shape[2:] != (env.model.nq,) or dump["ctrl"].shape[2:] != (env.model.nu,):
             raise ValueError("its shapes are not those of its task")
     except Exception as error:  # numpy has no common class for what can be wrong with a file

@@ -88,11 +88,20 @@ def read_joints(path, spec, wanted):
     return names, [name for name in found if name not in names]
 
 
+def keep_rotors(spec):
+    """Move rotor inertia that stands at motors to their joints."""
+    for motor in spec.actuators:
+        joint = spec.joint(motor.target)
+        if joint is not None:
+            joint.armature += motor.armature * motor.gear[0] ** 2
+
+
 def isolate(path, spec, names):
     """Leave only the robot, free and without meshes; joints without a name in `names` become stiff at 0.
 
     Returns its base's name.
     """
+    keep_rotors(spec)
     reader.drop(spec, "actuators", "keys", "equalities")
     roots = list(spec.worldbody.bodies)
     count = [sum(joint.name in names for joint in root.find_all(JOINT)) for root in roots]
@@ -391,8 +400,8 @@ def check_policy(path, facts, shapes):
     if lacking or "command" not in shapes:
         what = f"lacks {', '.join(lacking)}" if lacking else "takes no command"
         raise records.UserError(f"{path} {what}; export a policy of a locomotion task with play.py --export")
-    if facts["robot"] not in ROBOTS:
-        raise records.UserError(f"{path} is for the robot {facts['robot']!r}; known are {', '.join(ROBOTS)}")
+    if "mjcf" in facts or facts["robot"] not in ROBOTS:
+        raise records.UserError(f"{path} is for the robot {facts['robot']!r} of a file; known are {', '.join(ROBOTS)}")
 
 
 def phase_of(facts, command, seconds):
