@@ -75,7 +75,7 @@ class Args:
     mirror_coef: float = 0.1  # weight of the mirror loss
     max_grad_norm: float = 1.0  # of actor and critic, each
     # --- Devices ---
-    distributed: bool = False  # this is one of several processes, one per host; process 0 writes the files
+    distributed: bool = False  # this is one of several processes, see docs/speed.md; process 0 writes the files
     shuffle_blocks: int | None = None  # shuffle samples within this many groups of environments; None: 1 per device
 
 

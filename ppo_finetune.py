@@ -37,7 +37,7 @@ class Args:
     robot: str | None = None  # MJCF or URDF file of the robot of --task loco; or a run's args.json
     network: Literal["mlp", "pidm"] | None = None  # of actor and critic; None: pidm with --pretrained, else mlp
     pretrained: str | None = None  # PIDM checkpoint written by pretrain_pidm.py
-    policy: str | None = None  # start from actor and critic of this policy.msgpack, e.g. to make it robust
+    policy: str | None = None  # start from this policy.msgpack, of the same network and observation
     load_into: Literal["both", "actor", "critic", "history_encoder", "shuffled", "none"] = "both"  # see `warm_start`
     # Deviation (weight init): rsl_rl has PyTorch's; with orthogonal weights both quadrupeds learn faster.
     weight_init: Literal["orthogonal", "pytorch", "pytorch_unscaled"] = "orthogonal"  # of layers that are not loaded
@@ -75,7 +75,7 @@ class Args:
     entropy_coef: float | None = None  # weight of the entropy bonus
     mirror_coef: float = 0.1  # weight of the mirror loss; ours, the paper gives no number
     max_grad_norm: float = 1.0  # of actor and critic, each
-    distributed: bool = False  # this is one of several processes, one per host; process 0 writes the files
+    distributed: bool = False  # this is one of several processes, see docs/speed.md; process 0 writes the files
     shuffle_blocks: int | None = None  # shuffle samples within this many groups of environments; None: 1 per device
 
 

@@ -55,7 +55,7 @@ class Args:
     lr: float = 1e-3  # initial Adam step size; falls to 0 along a cosine
     patience: int | None = None  # lr falls over so many epochs, once as many brought no lower error; None: throughout
     # --- Devices ---
-    distributed: bool = False  # this is one of several processes, one per host; process 0 writes the files
+    distributed: bool = False  # this is one of several processes, see docs/speed.md; process 0 writes the files
 
 
 PRESETS = {

@@ -19,10 +19,11 @@ PIECE = 2048  # samples whose activations fit the cache of a CPU core
 
 
 def join(distributed):
-    """Join the other processes with --distributed, one on each host. All but the first print nothing.
+    """Join the other processes with --distributed. All but the first print nothing.
 
-    SLURM and Open MPI tell a process who it is; elsewhere set JAX_COORDINATOR_ADDRESS (host:port of process 0),
-    JAX_NUM_PROCESSES and JAX_PROCESS_ID. UserError if nothing does, or if JAX finds no device.
+    SLURM and Open MPI tell a process who it is, and JAX gives it one GPU there. Elsewhere it has all of its host: set
+    JAX_COORDINATOR_ADDRESS (host:port of process 0), JAX_NUM_PROCESSES and JAX_PROCESS_ID. UserError if nothing does,
+    or if JAX finds no device.
     """
     if distributed:
         count, number = (os.environ.get(f"JAX_{name}") for name in ("NUM_PROCESSES", "PROCESS_ID"))

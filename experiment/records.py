@@ -276,12 +276,17 @@ RESULTS = (
 def load_policy(path, like, env):
     """Params of a policy file, but with the action std of `like`. UserError if it lacks the leaves and shapes of that.
 
-    A trained policy has a small std, with which it would hardly explore. UserError also if it is of another body.
+    A trained policy has a small std, with which it would hardly explore. UserError also if it is of another robot,
+    body or network.
     """
     params, meta = load(Path(path), "policy")
     task = envs.TASKS.get(meta["task"])  # None of a robot from a file, whose body tells it apart
     if task and task[1].robot != env.robot.name:
         raise UserError(f"{path} is a policy for robot {task[1].robot}, here is robot {env.robot.name}")
+    here = "pidm" if "normalizer" in like else "mlp"
+    network = meta["args"].get("network", here)
+    if network != here:
+        raise UserError(f"{path} has the network {network}; give --network {network}")
     check_body(path, meta, env)
     check_shapes(path, params, like)
     params = jax.tree.map(jnp.asarray, params)

@@ -174,7 +174,9 @@ class Run:
 
     def report_interrupt(self):
         """If the run was stopped, say how it can go on."""
-        if self.stopped:
+        if self.stopped and jax.process_count() > 1:
+            print("interrupted; runs of several processes save no state to go on from")
+        elif self.stopped:
             print(f"interrupted; --resume {' or '.join(args.run_dir for args in self.each)} goes on from here")
 
 

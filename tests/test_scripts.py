@@ -210,6 +210,10 @@ def test_set_from_the_command_line():
             {"task": "anymal_loco", "policy": str(ROOT / "results/tasks/go1_loco/policy.msgpack")},
             ["is a policy for robot go1, here is robot anymal_d"],
         ),
+        (
+            {"task": "go1_loco", "network": "pidm", "policy": str(ROOT / "results/tasks/go1_loco/policy.msgpack")},
+            ["has the network mlp; give --network mlp"],
+        ),
         ({"seed": -1}, ["--seed must be at least 0, not -1"]),
         ({"seed": 2**32}, ["--seed must be at least 0", "below 4294967296"]),
         ({"lr": -1.0}, ["--lr must be above 0, not -1.0"]),
