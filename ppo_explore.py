@@ -580,8 +580,8 @@ def explore(args):
                 dataset.flush(arrays)  # before the state that records how far they are filled
                 run.save([state])
     if run.iteration < iterations:
-        print(f"interrupted: {args.run_dir} is an unfinished collection; --resume {args.run_dir} goes on with it")
-        return None
+        print(f"{args.run_dir} is an unfinished collection")
+        return run.report_interrupt()
     if folder:
         dataset.finish(folder, arrays, args, env, iterations, num_held_out(args))
         figures.plot_training(run.rows[0], folder / "curve.png")

@@ -23,7 +23,6 @@ import numpy as np
 import optax
 import tyro
 
-import envs
 from envs.base import NOISE, PROP
 from experiment import dataset, devices, figures, metrics, records
 from experiment.run import Run
@@ -373,20 +372,17 @@ def pretrain(args):
 def open_data(args):
     """The collection args.data and its robot's environment. UserError if they do not fit together."""
     data = Dataset(args.data)
-    robot = data.meta["robot"]
-    env = envs.make_explore(dataset.robot_of(data.meta), "c", history=data.meta["history"])
-    if data.meta["layout"] != list(env.prop_layout):
-        raise records.UserError(f"{args.data} has x = {data.meta['layout']}, not {list(env.prop_layout)}")
+    env = dataset.env_of(args.data, data.meta)
     for name, width in (("x", env.prop_dim), ("action", env.action_dim)):
         found = getattr(data, name).shape[-1]
         if found != width:
-            raise records.UserError(f"{args.data}/{name}.npy holds {found} numbers a step, {robot} has {width}")
+            raise records.UserError(f"{args.data}/{name}.npy holds {found} numbers a step, the robot has {width}")
     return data, env
 
 
 def checkpoint_meta(args, env, data, sizes, row):
     """Description of a PIDM checkpoint, stored in it."""
-    meta = {name: data.meta[name] for name in ("robot", "layout", "history")}
+    meta = {name: data.meta.get(name) for name in ("robot", "layout", "history", "action_scale", "dt")}
     meta["dataset"] = {name: data.meta[name] for name in ("transitions", "args", "versions")}
     return meta | {"body": env.config.body, "sizes": dict(sizes), "args": dataclasses.asdict(args), "metrics": row}
 
@@ -453,6 +449,8 @@ def validate(args, env, net, variables, data, folder):
 def run_validation(args):
     """Validate the PIDM of --eval on the collection --data. UserError if the two do not fit."""
     path = Path(args.eval)
+    if not path.is_file():
+        raise records.UserError(f"--eval {path}: there is no such file")
     data, env = open_data(args)
     net = PIDM(SIZES[env.robot.like], env.action_dim)
     like = jax.eval_shape(partial(init_variables, args, env, net), data.windows(data.validation[:1]))

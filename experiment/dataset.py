@@ -124,6 +124,21 @@ def robot_of(meta):
     return (config.get("body") if isinstance(config, dict) else None) or meta["robot"]
 
 
+def env_of(folder, meta):
+    """Environment of a collection's robot. UserError if the robot, x or the scale of actions is another one today."""
+    try:
+        env = envs.make_explore(robot_of(meta), "c", history=meta["history"])
+        scale = np.broadcast_to(np.array(meta.get("action_scale", env.robot.action_scale), float), env.action_dim)
+    except (ValueError, KeyError, TypeError) as error:
+        raise records.UserError(f"{folder}/meta.json is damaged: {error!r}; collect the data again") from None
+    if meta["layout"] != list(env.prop_layout):
+        raise records.UserError(f"{folder} has x = {meta['layout']}, not {list(env.prop_layout)}")
+    if not np.array_equal(scale, env.robot.action_scale):
+        found, ours = scale.tolist(), list(env.robot.action_scale)
+        raise records.UserError(f"{folder} has action_scale = {found}, not {ours}; collect the data again")
+    return env
+
+
 def read_array(folder, name, meta):
     """One memory-mapped array of a collection. UserError if it is missing, damaged or not as meta.json says."""
     path, (dtype, axes) = Path(folder) / f"{name}.npy", KINDS[name]

@@ -63,6 +63,7 @@ def plot_accuracy(change, error, path, samples=1000):
     edges = np.linspace(0, np.quantile(size, 0.995), 21)
     bins = np.digitize(size, edges)
     rows = [(size[bins == i].mean(), error[bins == i]) for i in range(1, len(edges)) if (bins == i).sum() > 20]
+    rows = rows or [(size.mean(), error)]  # of a handful of transitions
     magnitude = np.array([size for size, _ in rows])
     quantiles = np.array([np.quantile(errors, (0.25, 0.5, 0.75)) for _, errors in rows])
     mean = np.array([errors.mean() for _, errors in rows])

@@ -302,7 +302,9 @@ def load_pidm(path, env, like):
         ways = "--pretrained names one; with --load-into none only its input normalisation is used"
         raise UserError(f"cannot read PIDM checkpoint {path}: No such file or directory; {ways}")
     content, meta = load(path, "PIDM checkpoint")
-    for name, here in (("robot", env.robot.name), ("layout", list(env.prop_layout)), ("history", env.config.history)):
+    ours = {"robot": env.robot.name, "layout": list(env.prop_layout), "history": env.config.history}
+    since = {"action_scale": list(env.robot.action_scale), "dt": env.dt}  # older checkpoints do not say
+    for name, here in (ours | {name: x for name, x in since.items() if meta.get(name) is not None}).items():
         if meta[name] != here:
             raise UserError(f"{path} was made for {name} {meta[name]}, here is {name} {here}")
     check_body(path, meta, env)

@@ -8,12 +8,11 @@
 It makes them at the paper's size: 7.6 M transitions of a robot, of which 0.6 M are for validation, and at most 100
 epochs. Files take 1.4 GB (G1 2.9).
 Weights go to assets/pidm/<robot>.msgpack, everything else to results/pidm/<robot>. Stage `sizes` also pretrains on
-small random parts of the same data (paper Sec. V-D), into results/pidm/<robot>/sizes. Stage `validate` measures the
-shipped weights again, on the data of stage `collect`.
+small random parts of the data of stage `collect` (paper Sec. V-D), into results/pidm/<robot>/sizes. Stage `validate`
+measures the shipped weights again, on the data of stage `collect`.
 """
 
 import json
-import subprocess
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -35,8 +34,9 @@ import ppo_explore
 import ppo_finetune
 import pretrain_pidm
 from experiment import devices, figures, records
+from results import recording
 
-SIZES = (7_000, 70_000, 700_000)  # transitions; the fourth of the paper's sizes, 7 M, is the shipped PIDM
+SIZES = (7_000, 70_000, 700_000)  # transitions; the fourth of the paper's sizes, 7 M, is the whole collection
 EXPLORE = ("--total-steps", "7600000")
 PRETRAIN = ("--epochs", "100", "--patience", "10")
 BLIND = ("anymal_loco", "anymal_pedipulation", "go1_loco", "g1_loco")  # tasks on flat ground without perception
@@ -45,24 +45,13 @@ EARLY = 100  # iterations of a task's training whose states the coverage figure 
 
 @dataclass(frozen=True)
 class Args:
-    robots: tuple[str, ...] = ("go1", "anymal_d", "g1")
-    preset: Literal["smoke", "cpu", "gpu"] = "cpu"
+    robots: tuple[Literal["go1", "anymal_d", "g1"], ...] = ("go1", "anymal_d", "g1")
     stages: tuple[Literal["collect", "pretrain", "validate", "look", "features", "sizes"], ...] = (
         "collect",
         "pretrain",
         "look",
         "features",
     )
-
-
-def run(*words):
-    """Run a script in a process of its own."""
-    subprocess.run([sys.executable, *words], cwd=ROOT, check=True)
-
-
-def at_size(args, words):
-    """These words, which set the paper's size, unless it is a smoke test."""
-    return () if args.preset == "smoke" else words
 
 
 def copy(source, target):
@@ -87,17 +76,18 @@ def validate(robot):
     """Measure and draw the shipped weights, without training them again."""
     folder = ROOT / f"runs/pidm/{robot}/shipped"
     copy(ROOT / f"assets/pidm/{robot}.msgpack", folder / "pidm.msgpack")
-    run("pretrain_pidm.py", "--data", f"runs/explore/{robot}/seed0", "--eval", str(folder / "pidm.msgpack"))
+    words = ("--data", f"runs/explore/{robot}/seed0", "--eval", str(folder / "pidm.msgpack"))
+    recording.run_script(["pretrain_pidm.py", *words])
     for name in ("validation.json", "accuracy.png", "distribution.png"):
         copy(folder / name, ROOT / f"results/pidm/{robot}" / name)
 
 
-def pretrain_on_parts(args, robot):
+def pretrain_on_parts(robot):
     """Pretrain on each of SIZES. Weights and validation error go to files of that name."""
     for size in SIZES:
         folder = f"runs/pidm/{robot}/{size}"
         words = ("--data", f"runs/explore/{robot}/seed0", "--num-samples", str(size), "--run-dir", folder)
-        run("pretrain_pidm.py", *words, "--preset", args.preset, "--force", *at_size(args, PRETRAIN))
+        recording.run_script(["pretrain_pidm.py", *words, "--force", *PRETRAIN])
         for name, suffix in (("pidm", "msgpack"), ("validation", "json"), ("metrics", "csv"), ("args", "json")):
             stem = str(size) if name == "pidm" else f"{size}_{name}"
             copy(ROOT / folder / f"{name}.{suffix}", ROOT / f"results/pidm/{robot}/sizes/{stem}.{suffix}")
@@ -245,13 +235,13 @@ def project(sets):
     return name, np.split(flat, np.cumsum([len(x) for x in sets])[:-1])
 
 
-def look(args, robot):
+def look(robot):
     """Compare the coverage of exploration, random actions and first iterations of tasks: numbers and a figure."""
     tasks = [task for task in BLIND if envs.TASKS[task][1].robot == robot]
     random = f"runs/explore/{robot}/random"
     if not (ROOT / random / "meta.json").exists():
-        words = ("--robot", robot, "--preset", args.preset, "--policy", "random", "--run-dir", random, "--force")
-        run("ppo_explore.py", *words, "--total-steps", "300000")
+        words = ("--robot", robot, "--policy", "random", "--run-dir", random, "--force", "--total-steps", "300000")
+        recording.run_script(["ppo_explore.py", *words])
     env = envs.make_explore(robot, "c")
     kinds = {
         "exploration": sample(ROOT / f"runs/explore/{robot}/seed0"),
@@ -302,21 +292,22 @@ def draw_coverage(points, title, path, gridsize=30):
 
 HEAD = """# Shipped PIDM checkpoints
 
-Made by `python results/pidm.py`, which runs the commands that stand below for each robot.
+The commands that stand below for each robot made them. Now `python results/pidm.py` collects 7.6 M transitions and
+trains until the error is flat, 100 epochs at most.
 
 Errors are on held-out environments, with the tasks' sensor noise. error_over_change is error_rad over the mean action
 magnitude |a_t - q_t|, joint target minus joint angle: the paper's normalised error, 0.4 to 0.5 there. normalized_error
 is over the mean action.
 
 Joint space is the share of a 20 x 20 grid over each pair of neighbouring joints of a limb that 20,000 samples visit.
-Maps have a panel for each set of states, 4,000 of each. Grey cells are those that exploration visits.
-Disagreement is that of an ensemble trained on the first tenth of the collection, there (seen) and on the last tenth
+Maps have a panel for each set of states, 4,000 of each. Grey cells are those that exploration visits. Disagreement is
+that of an ensemble trained on the first tenth of the collection, on what it was trained on (seen) and on the last tenth
 (novel). The recorded policy is that of results/tasks, with its noise: a gait that the PIDM never saw. Features are the
 outputs of the actor's backbone in the first rollout of a task. Their effective rank (Roy and Vetterli 2007) is the
 number of directions, of 64, that they fill. The study's pretrained arm is "loaded, the rest as PyTorch's".
 
 """
-AGAIN = ("anymal_d", "go1")  # robots whose weights are older than the data they were measured on
+AGAIN = ("anymal_d", "go1")  # robots whose weights are older than the data they were measured on, until made anew
 FIRST = """Of {robots}: errors were measured (`--stages collect validate`) on a collection that these commands made on
 another machine. It differs in its bits, so the weights have seen nothing of it. The last row of metrics.csv is on the
 collection of the training.
@@ -360,20 +351,20 @@ def main(args):
     devices.find()
     for robot in args.robots:
         if "collect" in args.stages:
-            run("ppo_explore.py", "--robot", robot, "--preset", args.preset, "--force", *at_size(args, EXPLORE))
+            recording.run_script(["ppo_explore.py", "--robot", robot, "--force", *EXPLORE])
         if "pretrain" in args.stages:
-            data = f"runs/explore/{robot}/seed0"
-            run("pretrain_pidm.py", "--data", data, "--preset", args.preset, "--force", *at_size(args, PRETRAIN))
+            words = ("--data", f"runs/explore/{robot}/seed0", "--force", *PRETRAIN)
+            recording.run_script(["pretrain_pidm.py", *words])
             keep(robot)
         if "validate" in args.stages:
             validate(robot)
         if "look" in args.stages:
-            look(args, robot)
+            look(robot)
         if "features" in args.stages:
             found = compare_features(robot, robot.removesuffix("_d") + "_loco")
             records.replace_text(ROOT / f"results/pidm/{robot}/features.json", json.dumps(found, indent=1) + "\n")
         if "sizes" in args.stages:
-            pretrain_on_parts(args, robot)
+            pretrain_on_parts(robot)
     write_readme()
 
 

@@ -18,6 +18,7 @@ import pytest
 
 import ppo_finetune
 import pretrain_pidm
+from envs.base import PROP
 from experiment import records
 from results import report
 
@@ -147,7 +148,7 @@ def collection(tmp_path_factory):
     np.save(folder / "first.npy", first)
     np.save(folder / "rough.npy", np.zeros(shape, bool))
     meta = {"robot": "go1", "iterations": 2, "num_steps": 8, "num_envs": 4, "history": 2, "validation_envs": [3]}
-    meta |= {"layout": list(pretrain_pidm.envs.base.PROP), "transitions": 64, "args": {}, "versions": {}}
+    meta |= {"layout": list(PROP), "transitions": 64, "args": {}, "versions": {}}
     (folder / "meta.json").write_text(json.dumps(meta))
     return folder
 

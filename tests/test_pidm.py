@@ -15,7 +15,7 @@ import pytest
 import envs
 import ppo_finetune as finetune
 import pretrain_pidm as script
-from experiment import records
+from experiment import figures, records
 from results import pidm
 
 K, X, A = 5, 30, 12  # Go1
@@ -529,7 +529,7 @@ def test_eval_of_another_robots_pidm_is_refused(pretrained, folder, tmp_path, re
     cut = tmp_path / "cut.msgpack"
     records.save(cut, jax.tree.map(lambda x: x[..., :-1], params), meta)
     refused(script.main, script.Args(data=str(folder), eval=str(cut)), "this task needs")
-    refused(script.main, script.Args(data=str(folder), eval=str(tmp_path / "none")), "cannot read PIDM checkpoint")
+    refused(script.main, script.Args(data=str(folder), eval=str(tmp_path / "none")), "--eval", "no such file")
     assert not (tmp_path / "validation.json").exists()
 
 
@@ -560,6 +560,15 @@ def test_bad_datasets_are_refused(tmp_path, refused):
     check(random_dataset(tmp_path / "c", robot="g1"), "x.npy", "30", "64")
     check(random_dataset(tmp_path / "d", layout=["gravity"]), "gravity")
     check(random_dataset(tmp_path / "e", validation_envs=[]), "validation")
+    check(random_dataset(tmp_path / "f", action_scale=0.5), "action_scale = [0.5", "not [0.25")
+    check(random_dataset(tmp_path / "g", config={"body": {"x": 1}}), "meta.json is damaged")
+
+
+def test_a_handful_of_transitions_makes_a_figure(tmp_path):
+    """A validation split can be that small after a smoke run."""
+    change = np.random.default_rng(0).normal(size=(1, A)).astype(np.float32)
+    figures.plot_accuracy(change, 0.1 * change, tmp_path / "accuracy.png")
+    assert (tmp_path / "accuracy.png").stat().st_size > 10_000
 
 
 def test_too_many_samples_are_refused(tmp_path, refused):
@@ -583,8 +592,9 @@ def test_bad_checkpoints_are_refused(pretrained, tmp_path, jitted, refused):
         return tmp_path / name
 
     check(tmp_path / "none", "cannot read PIDM checkpoint")
-    for name, value in (("robot", "g1"), ("layout", ["gravity"]), ("history", 3)):
-        check(changed(name, params, meta | {name: value}), f"{name} {value}", f"{name} {meta[name]}")
+    ours = meta | {"action_scale": [0.25] * 12, "dt": 0.02}
+    for name, value in {"robot": "g1", "layout": ["gravity"], "history": 3, "action_scale": [0.5], "dt": 0.04}.items():
+        check(changed(name, params, meta | {name: value}), f"{name} {value}", f"{name} {ours[name]}")
     (tmp_path / "cut").write_bytes(path.read_bytes()[:-50])
     check(tmp_path / "cut", "damaged")
     check(changed("policy", params, {"task": "go1_loco", "args": {}}), "not a PIDM checkpoint")
