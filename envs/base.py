@@ -157,6 +157,10 @@ class Env:
         self.engine = make_engine(engine, spec, config.decimation)
         self.model = self.engine.model
         self.episode_steps = round(config.episode_seconds / self.dt)
+        if not self.episode_steps:
+            raise ValueError(f"episode_seconds must be at least a control step of {self.dt:g} s")
+        if (lightest := self.model.body_mass[1] * config.link_mass[0] + config.added_mass[0]) <= 0:
+            raise ValueError(f"added_mass and link_mass leave the base with {lightest:.2f} kg")
         self.action_dim = len(self.robot.joints)
         self.default_pose = jnp.array(self.robot.default_pose)
         self.action_scale = jnp.array(self.robot.action_scale)
@@ -532,9 +536,14 @@ class Env:
             "planar": np.array([polar[0], polar[1], axial[2]]),
             "scalar": np.array([1]),
             "heading": np.array([-1, 1]),  # sine, cosine of an angle about z
-            "phase": np.array([-1, -1]),  # sine, cosine of a gait's clock; the other foot is half a step ahead
+            "phase": np.array([-1, -1]) if self.swaps_steps(mirror) else np.array([1, 1]),
         }
         return np.arange(len(signs[kind])), signs[kind]
+
+    def swaps_steps(self, mirror):
+        """True if a foot and its image are half a step apart, so that sine and cosine of the gait's clock turn over."""
+        gait = np.array(self.robot.gait)
+        return not np.allclose(gait[self.robot.mirror_feet(mirror)], gait)
 
     def mirror_tables(self, mirror):
         """perm, sign of `obs`, `prop` and `action` vectors: mirrored = sign * original[perm]."""

@@ -54,9 +54,23 @@ class Config:
         for name in POSITIVE:
             if np.min(getattr(self, name, 1)) <= 0:
                 raise ValueError(f"{name} must be above 0, not {getattr(self, name)}")
+        for name, (least, most) in LIMITS.items():
+            value = getattr(self, name, least)
+            if np.min(value) < least or np.max(value) > most:
+                raise ValueError(f"{name} must be from {least:g} to {most:g}, not {value}")
 
 
-POSITIVE = ("episode_seconds", "physics_dt", "decimation", "history", "command_seconds", "perturb_seconds", "amplitude")
+POSITIVE = (
+    *("episode_seconds", "physics_dt", "decimation", "history", "command_seconds", "perturb_seconds", "amplitude"),
+    *("push_seconds", "link_mass", "motor_strength"),
+)
+AT_LEAST_0 = (
+    *("noise", "scan_noise", "scan_shift", "spawn_xy", "spawn_yaw", "spawn_spread", "spawn_velocity", "friction"),
+    *("joint_friction", "push_velocity", "perturb_force", "yaw_rate", "tracking_seconds", "gait_hz", "swing_height"),
+    *("base_force", "foot_force", "all_feet_force", "velocity_limit", "random_seconds", "hasty", "air_time_threshold"),
+)
+LIMITS = dict.fromkeys(AT_LEAST_0, (0, np.inf)) | dict.fromkeys(("standing", "turning", "on_the_spot", "rough"), (0, 1))
+LIMITS |= {"stance": (0.05, 0.95), "max_tilt": (1, 180), "reward_floor": (-np.inf, 0)}
 FIXED = {
     "robot": "it belongs to the task",
     "body": "it is what --robot FILE loads",
@@ -97,7 +111,8 @@ def replace_checked(config, overrides):
         except ValueError:
             words = " or ".join(WORDS.get(kind, str(kind)) for kind in alternatives(kinds[name]))
             raise ValueError(f"{name} takes {words}, not {value!r}") from None
-        if kinds[name] == Range and values[name][0] > values[name][1]:
+        ranges = {Range: [values[name]], tuple[Range, Range, Range]: values[name]}.get(kinds[name], ())
+        if any(low > high for low, high in ranges):
             raise ValueError(f"{name} takes its lower end first, not {value!r}")
     weights = values.pop("weights", config.weights)
     weights = {term: values.pop(f"weights.{term}", weight) for term, weight in weights.items()}
@@ -108,6 +123,8 @@ def parse(text, kind):
     """Read a value of annotation `kind` from text. ValueError if the text is none."""
     if kind is str:
         return text
+    if typing.get_origin(kind) is dict:
+        raise ValueError("no dict can be typed")
     if kind == tuple[str, ...]:
         return tuple(text.split(","))
     literal = text.capitalize() if text.lower() in ("true", "false", "none") else text

@@ -31,11 +31,9 @@ class Explore(Env):
     OBS = {name: BODY[name] for name in BODY if name != "lin_vel"}
 
     def __init__(self, config, engine="auto"):
-        """Build it. ValueError for numbers that would spoil the data."""
+        """Build it. ValueError for noise, which would spoil the data."""
         if config.noise:
             raise ValueError("noise cannot be set here: data have none, and pretrain_pidm.py --noise adds it")
-        if not 0 <= config.rough <= 1:
-            raise ValueError(f"rough is a share, from 0 to 1, not {config.rough}")
         self.heights = terrain.perlin_heights(config.amplitude) * (config.rough > 0)
         super().__init__(config, engine)
 

@@ -37,7 +37,7 @@ class Robot:
     default_pose: tuple[float, ...]  # (A,) [rad] joint targets of action zero
     action_scale: tuple[float, ...]  # (A,) [rad] change of the joint target per unit of action
     feet: tuple[str, ...]  # (F,) sites; sensors <foot>_pos, <foot>_vel and <foot>_force
-    gait: tuple[float, ...]  # (F,) share of a step by which a foot is ahead; every mirror image is half a step ahead
+    gait: tuple[float, ...]  # (F,) share of a step by which a foot is ahead
     sole: float  # [m] height of a foot's site above the ground it stands on
     mirrors: dict[str, dict]  # symmetry -> images of its `joints`, their `signs`, and images of its `feet`
 

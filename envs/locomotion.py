@@ -36,6 +36,11 @@ class LocomotionConfig(Config):
     march: bool = False  # the clock runs on while the robot is told to stand
     effort_joints: tuple[str, ...] = ("",)  # parts of the names of joints with torque and acceleration penalties
 
+    def __post_init__(self):
+        super().__post_init__()
+        if (shares := self.turning + self.on_the_spot) > 1:
+            raise ValueError(f"turning and on_the_spot are shares, together at most 1, not {shares:g}")
+
 
 @flax.struct.dataclass
 class Task(FootClocks):

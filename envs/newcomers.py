@@ -32,8 +32,8 @@ def scaled(weights, body):
 
 def shared(body):
     """Fields of every config for a body."""
-    fields = {name: body[name] for name in ("added_mass", "contact_ends")}
-    return {name: tuple(value) for name, value in fields.items()} | {"robot": body["name"], "body": body}
+    fields = {name: tuple(body[name]) for name in ("added_mass", "contact_ends")}
+    return fields | {"robot": body["name"], "body": body, "max_tilt": body["max_tilt"]}
 
 
 def loco(body):
@@ -47,7 +47,7 @@ def loco(body):
     weights |= scaled(terms, body) | {"track_yaw_rate": 1.5, "orientation": -1.0, "air_time": 0.0, "pose": -0.2}
     same = ("ppo", "termination_reward", "lin_vel_x", "lin_vel_y", "command_seconds", "standing", "turning")
     same += ("on_the_spot", "tracking_seconds", "gait_hz", "swing_height")
-    fields = {name: getattr(G1_LOCO, name) for name in same} | {"max_tilt": body["max_tilt"]}
+    fields = {name: getattr(G1_LOCO, name) for name in same}
     fields["march"] = True  # H1, told to stand, fell once it had put both feet down
     robust |= ROBUST | {"tracking_seconds": 0.2, "lin_vel_x": (-0.8, 1.2)}
     return dataclasses.replace(GO1_LOCO, **shared(body), **fields, weights=weights, robust=robust)
@@ -58,5 +58,5 @@ def explore(body):
     like = EXPLORE["go1" if len(body["feet"]) > 2 else "g1"]
     fields = {name: getattr(like, name) for name in ("ppo", "noise", "reward_floor", "friction", "link_mass")}
     fields |= {name: getattr(like, name) for name in ("spawn_joints", "spawn_velocity", "push_seconds")}
-    fields |= {name: body[name] for name in ("perturb_force", "push_velocity", "max_tilt")}
+    fields |= {name: body[name] for name in ("perturb_force", "push_velocity")}
     return ExploreConfig(**shared(body), **fields, weights=scaled(EXPLORE["go1"].weights, body))

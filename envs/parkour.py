@@ -164,7 +164,8 @@ class Parkour(Env):
         k_yaw, k_shift = jax.random.split(key)
         zero = jnp.zeros((len(self.robot.feet), 3))
         to_goal = course.goal[:2] - physics.qpos[:2]
-        shift = uniform(k_shift, -self.config.scan_shift, self.config.scan_shift, (3,))
+        width = self.config.noise * self.config.scan_shift
+        shift = uniform(k_shift, -width, width, (3,))
         return Task(
             goal=course.goal,
             goal_yaw=jnp.arctan2(to_goal[1], to_goal[0]) + uniform(k_yaw, -0.3, 0.3),
@@ -195,7 +196,7 @@ class Parkour(Env):
         if self.overhead.any():
             xy = self.grid(CEILING_GRID, motion, task)
             under = terrain.underside_heights(motion.mocap_pos[self.overhead], self.half[self.overhead], xy)
-            noise = task.shift[2] + self.scan_noise(k_ceiling, under.shape)
+            noise = self.scan_noise(k_ceiling, under.shape) - task.shift[2]  # up where the ground is down
             sensed["ceiling"] = jnp.clip(under - motion.base_pos[2] + noise, 0.0, 1.0)
         return sensed, prop
 
@@ -312,12 +313,11 @@ class Parkour(Env):
 
 
 # Deviation (parkour rewards): Of Hoeller et al.'s weights, torque_limit is a tenth, and base_acc and feet_acc are a
-# fifth and bounded. The position term and the total have floors. heading counts within 0.5 m. A failure costs 4, and a
-# tilt of 80 degrees is one. At CPU batch sizes the full penalties teach the robot to stay where it is. action_rate is
-# in units of actions. `approach` pays for metres towards the goal; their cosine between velocity and goal favours
-# creeping. `stand` and `on_feet` count in the last second within 0.5 m, where success is judged. Their `stand` alone,
-# within 0.25 m at any time, is avoided by stopping farther away, and asks for no feet: after climbing up robots
-# ended on knees or nose.
+# fifth and bounded. The position term and the total have floors. heading counts within 0.5 m. A tilt of 80 degrees is a
+# failure. At CPU batch sizes the full penalties teach the robot to stay where it is. action_rate is in units of
+# actions. `approach` pays for metres towards the goal; their cosine between velocity and goal favours creeping. `stand`
+# and `on_feet` count in the last second within 0.5 m, where success is judged. Their `stand` alone, within 0.25 m at
+# any time, is avoided by stopping farther away, and asks for no feet: after climbing up robots ended on knees or nose.
 WEIGHTS = {
     "position": 10.0,
     "heading": 5.0,

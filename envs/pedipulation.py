@@ -29,8 +29,8 @@ class PedipulationConfig(Config):
     curriculum: bool = False  # grow the box with the success of each environment (off in the paper)
     fixed_point: tuple[float, float, float] | None = None  # [m] the one point, for evaluation
     command_seconds: float = 6.0  # time between points
-    all_feet_force: float = 0.0  # [N] largest constant force on every foot, per axis
-    foot_force: float = 0.0  # [N] half-width of a changing force on the pointing foot, per axis
+    all_feet_force: float = 0.0  # [N] largest constant force on every shank's centre of mass, per axis
+    foot_force: float = 0.0  # [N] half-width of the pointing leg's, which changes at pushes, per axis
 
 
 @flax.struct.dataclass
@@ -58,7 +58,7 @@ class Pedipulation(Env):
         legs = [foot.removesuffix("_foot") for foot in self.robot.feet]
         parts = [f"{leg}_{part}_force" for leg in legs for part in ("thigh", "knee", "shank")]
         self.collision_sensors = self.engine.sensor(*parts, f"{config.foot}_force")
-        self.command_steps = round(config.command_seconds / self.dt)
+        self.command_steps = max(round(config.command_seconds / self.dt), 1)
 
     def first_curriculum(self):
         return {"difficulty": jnp.zeros(())}

@@ -12,7 +12,7 @@ from results.grid import ANYMAL, GO1, METHODS, SCALES, SLOW_PIDMS, TABLE_1, TASK
 
 WALKING = GO1 + ANYMAL  # tasks that are run at several batches
 MODULES = ("intention_encoder", "history_encoder", "backbone", "action_synthesizer")  # of the actor
-COLOURS = {  # of a method; dashed if only its initial weights differ
+COLOURS = {  # of a method; dashed if only its initial weights or largest step size differ
     "mlp": "#009E73",
     "pidm_random": "#0072B2",
     "pidm_pretrained": "#D55E00",
@@ -63,7 +63,13 @@ def batch(runs):
     return "{num_envs} x {num_steps}".format(**settings) if settings else ""
 
 
-def draw_task(ax, title, runs, methods, extra=None):
+def title(task, runs):
+    """Title of a task, which says so if its runs were made before the task was changed."""
+    earlier = any(run.get("earlier") for arm in runs.values() for run in arm)
+    return TASKS[task] + " (earlier task)" * earlier
+
+
+def draw_task(ax, heading, runs, methods, extra=None):
     """Curves of a task, the level of 90%, and where each method gets there on average; steps on a second axis."""
     first = next(iter(runs.values()))[0]
     for method in [method for method in methods if method in runs]:
@@ -81,7 +87,7 @@ def draw_task(ax, title, runs, methods, extra=None):
         ax.plot(*extra[1:], color="black", label=extra[0])
     parkour = "progress" in first["columns"]
     seeds_of = measures.seeds(runs, [method for method in methods if method in runs])
-    ax.set(title=f"{title} (n = {seeds_of})", xlabel="PPO iteration", ylim=(0, None))
+    ax.set(title=f"{heading} (n = {seeds_of})", xlabel="PPO iteration", ylim=(0, None))
     ax.set_ylabel("curriculum progress" if parkour else "episode return")
     per_iteration = first["columns"]["env_steps"][-1] / first["iteration"][-1] / 1e6
     above = ax.secondary_xaxis("top", functions=(lambda x: x * per_iteration, lambda x: x / per_iteration))
@@ -99,8 +105,8 @@ def draw_curves(titled, path, methods=TABLE_1, extra=None):
     fig, axes = panels(-(-len(titled) // columns), columns, **alone)
     for ax in axes.ravel()[len(titled) :]:
         ax.axis("off")
-    for ax, (title, runs) in zip(axes.ravel(), titled.items(), strict=False):
-        draw_task(ax, title, runs, methods, extra)
+    for ax, (heading, runs) in zip(axes.ravel(), titled.items(), strict=False):
+        draw_task(ax, heading, runs, methods, extra)
     dots = "dots: mean iteration at which a run gets there; hollow if some do not, and count by their length"
     legend_below(fig, axes.ravel(), f"{SHADE}\n{dots}", columns=4 if columns > 1 else 3)
     figures.save(fig, path, dpi=80)
@@ -117,7 +123,7 @@ def draw_controls(study, path):
     fig, axes = panels(len(known), 2, 5.2, sharey="row")
     for row, (task, runs) in zip(axes, known.items(), strict=True):
         for ax, methods, weights in zip(row, (left, right), ("PyTorch's", "orthogonal"), strict=True):
-            draw_task(ax, TASKS[task], runs, [method for method in methods if method in runs])
+            draw_task(ax, title(task, runs), runs, [method for method in methods if method in runs])
             ax.set_title(f"{ax.get_title()}\n{weights} weights", fontsize=10)
     legend_below(fig, axes.ravel(), SHADE, columns=3)
     figures.save(fig, path, dpi=80)
@@ -179,7 +185,7 @@ def draw_success(study, path):
         labels = [f"{METHODS[m].title} (n = {len(study[task][m])})" for m in methods]
         ax.set_yticks(range(len(methods)), labels, fontsize=9)
         ax.set_xticks(range(table.shape[1]), range(table.shape[1]), fontsize=8)
-        ax.set_title(TASKS[task], fontsize=10, loc="left")
+        ax.set_title(title(task, study[task]), fontsize=10, loc="left")
     axes[-1, 0].set_xlabel("level of the course: 0 easiest, 9 hardest")
     fig.colorbar(image, ax=axes, label="episodes of the mean action that succeed [%]", shrink=0.5, aspect=30)
     figures.save(fig, path, dpi=90)
@@ -262,8 +268,8 @@ def draw_critics(study, path):
                     )
         column[0].set_title(f"{TASKS[task]}, {batch(study[task])}")
         column[-1].set_xlabel("PPO iteration")
-    for row, (name, title) in zip(axes, CRITIC.items(), strict=True):
-        row[0].set_ylabel(title)
+    for row, (name, what) in zip(axes, CRITIC.items(), strict=True):
+        row[0].set_ylabel(what)
         for ax in row:
             ax.grid(alpha=0.3)
             ax.set_yscale("log" if name in ("lr", "critic_grad_norm") else "linear")

@@ -27,7 +27,7 @@ sys.path.insert(0, str(ROOT))
 
 from experiment import figures, records
 from results import drawing, measures
-from results.grid import CONTROLS, METHODS, SCALES, TABLE_1, TASKS, task_of, titles
+from results.grid import CONTROLS, METHODS, SCALES, TABLE_1, TASKS, is_earlier, task_of, titles
 from results.measures import MEASURES
 
 STUDY = ROOT / "results/study"
@@ -96,6 +96,7 @@ def load_run(folder):
             "settings": {key: record[key] for key in keys}
             | {"config": task_of(record["config"]), "levels": list(success)},
             "seed": record["seed"],
+            "earlier": is_earlier(*folder.parts[-4:-2]),
             "versions": record["versions"],
         }
     except (OSError, ValueError, KeyError, TypeError, IndexError, AttributeError) as error:
@@ -173,7 +174,7 @@ def table_1(study, tasks=tuple(TASKS)):
     rows = []
     for task in tasks:
         runs = study.get(task, {})
-        row = {"task": TASKS[task], "batch": drawing.batch(runs), "seeds": measures.seeds(runs, TABLE_1)}
+        row = {"task": drawing.title(task, runs), "batch": drawing.batch(runs), "seeds": measures.seeds(runs, TABLE_1)}
         for i, (head, method, name) in enumerate(columns):
             found = measures.compare(task, runs, method, name)
             row |= {head: shown(found), "paper" + " " * i: paper(method, name, task)}
@@ -212,7 +213,7 @@ def along_the_way(study):
     for task, runs in study.items():
         if "pidm_random" not in runs:
             continue
-        row = {"task": TASKS[task]}
+        row = {"task": drawing.title(task, runs)}
         row |= {head: shown(measures.compare(task, runs, method, name)) for head, method, name in columns}
         for head, method, name in columns_of({"mean action": "mean action"}):
             row[head] = shown(measures.compare(task, runs, method, name), "")
@@ -257,7 +258,7 @@ def controls(loaded):
         studies = [study[task] for study in loaded.values() if task in study]
         for runs, (method, against) in itertools.product(studies, PAIRS):
             if arms := measures.same_seeds(runs, method, against):
-                row = {"task": TASKS[task], "batch": drawing.batch(runs)}
+                row = {"task": drawing.title(task, runs), "batch": drawing.batch(runs)}
                 row |= {"method": METHODS[method].title, "against": METHODS[against].title}
                 row["seeds"] = ", ".join(str(run["seed"]) for run in arms[method])
                 for name, title in CONTROLLED.items():
@@ -294,7 +295,7 @@ def updates_table(study):
             for name in ("lr", *(f"update/actor/{module}" for module in drawing.MODULES))
         }
         step = ratio.pop("lr")
-        row = {"task": TASKS[task], "seeds": measures.seeds(runs, ("pidm_pretrained", "pidm_random"))}
+        row = {"task": drawing.title(task, runs), "seeds": measures.seeds(runs, ("pidm_pretrained", "pidm_random"))}
         row |= {name.split("/")[-1].replace("_", " "): f"{100 * (x - 1):+.0f}" for name, x in ratio.items()}
         row |= {"step size": f"{100 * (step - 1):+.0f}"}
         row |= {"backbone per step size": f"{100 * (ratio['update/actor/backbone'] / step - 1):+.0f}"}
@@ -309,7 +310,7 @@ def progress_table(study):
         goal = measures.goal_of(runs["pidm_random"]) if "pidm_random" in runs else None
         for method, mine in runs.items():
             each = {name: measures.values(name, mine, goal) for name in ("final", "area")}
-            row = {"task": TASKS[task], "method": METHODS[method].title}
+            row = {"task": drawing.title(task, runs), "method": METHODS[method].title}
             row["seeds"] = ", ".join(str(run["seed"]) for run in mine)
             row["final"] = spread(each["final"])
             row["of it in the last third [%]"] = f"{100 * np.mean([measures.late_gain(run) for run in mine]):.0f}"
@@ -335,7 +336,7 @@ def actions_table(study):
     )
     for task, runs in chosen.items():
         for method, mine in runs.items():
-            row = {"task": TASKS[task], "method": METHODS[method].title, "seeds": str(len(mine))}
+            row = {"task": drawing.title(task, runs), "method": METHODS[method].title, "seeds": str(len(mine))}
             for name in names:
                 known = [run["errors"][name] for run in mine if name in run["errors"]]
                 row[name.replace("_", " ")] = f"{np.mean(known):.3g}" if known else ""
@@ -350,7 +351,7 @@ def sizes_and_machines(study):
         one = next(iter(runs.values()))[0]
         size = f"{drawing.batch(runs)}, {one['settings']['total_steps'] / 1e6:.1f} M steps"
         machines = sorted({"{device}, {machine}".format(**run["versions"]) for arm in runs.values() for run in arm})
-        lines.append(f"- {TASKS[task]}: `{task}`, {size}, {'; '.join(machines)}")
+        lines.append(f"- {drawing.title(task, runs)}: `{task}`, {size}, {'; '.join(machines)}")
     return lines
 
 
@@ -412,7 +413,7 @@ def load_study():
 def pick(loaded, methods=TABLE_1):
     """Runs of each task at the scale that has most of these methods, of each at most two seeds counting.
 
-    The later of grid.py where several have as many: a larger batch takes the place of a smaller one at two seeds.
+    The later of grid.py where several have as many.
     """
     chosen = {}
     for task in TASKS:
@@ -486,7 +487,9 @@ def draw_all(loaded):
     """Draw the figures that the runs allow, and remove those that they no longer allow."""
     study = pick(loaded)
     drawn = {
-        "curves": lambda path: drawing.draw_curves({TASKS[task]: runs for task, runs in study.items()}, path),
+        "curves": lambda path: drawing.draw_curves(
+            {drawing.title(task, runs): runs for task, runs in study.items()}, path
+        ),
         "curves_batch": lambda path: drawing.draw_curves(drawing.curves_by_scale(loaded), path),
         "controls": lambda path: drawing.draw_controls(pick(loaded, CONTROLS), path),
         "critics": lambda path: drawing.draw_critics(loaded.get("batch", {}), path),
@@ -504,23 +507,32 @@ def draw_all(loaded):
 def beside(folder):
     """Draw a run with the recorded ones of its task, in its own folder. UserError if either is missing.
 
-    The recorded ones are those of the same number of environments, if there are any.
+    The recorded ones are those of the same task, if there are any, and of the same number of environments.
     """
     try:
         args = json.loads((folder / "args.json").read_text())
-        task = args["task"]
+        task, config = args["task"], task_of(args["config"])
         with (folder / "metrics.csv").open() as file:
             rows = list(csv.DictReader(file))
         name = "progress" if "progress" in rows[0] else "episode_return"
         points = [(float(row["iteration"]), float(row[name])) for row in rows]
-    except (OSError, ValueError, KeyError, IndexError) as error:
+    except (OSError, ValueError, KeyError, IndexError, TypeError) as error:
         raise records.UserError(f"{folder} is not a run of ppo_finetune.py: {error}") from None
     known = [study[task] for study in load_study().values() if task in study]
     if not known:
         raise records.UserError(f"results/study has no runs of {task}")
-    runs = max(known, key=lambda runs: drawing.batch(runs) == "{num_envs} x {num_steps}".format(**args))
+
+    def likeness(runs):
+        (one, *_), *_ = runs.values()
+        return one["settings"]["config"] == config, drawing.batch(runs) == "{num_envs} x {num_steps}".format(**args)
+
+    runs = max(known, key=likeness)
+    if not likeness(runs)[0]:
+        print(f"the recorded runs of {task} had other numbers in its config")
     path = folder / "beside_recorded.png"
-    drawing.draw_curves({TASKS[task]: runs}, path, tuple(METHODS), ("this run", *zip(*points, strict=True)))
+    drawing.draw_curves(
+        {drawing.title(task, runs): runs}, path, tuple(METHODS), ("this run", *zip(*points, strict=True))
+    )
     print(f"wrote {path}")
 
 

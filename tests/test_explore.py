@@ -257,7 +257,7 @@ def test_stages_one_to_three_through_files(collected, tmp_path):
         ({"members": 0}, ["--members must be at least 1"]),
         ({"members": 1}, ["--members 1 cannot disagree", "--policy random"]),
         ({"set": ("rough=2m",)}, ["rough takes a number like 0.5, not '2m'"]),
-        ({"set": ("rough=-0.5",)}, ["rough is a share", "-0.5"]),
+        ({"set": ("rough=-0.5",)}, ["rough must be from 0 to 1, not -0.5"]),
         ({"set": ("noise=1",)}, ["noise cannot be set here", "pretrain_pidm.py --noise"]),
         ({"set": ("calm=0.5",)}, ["unknown option 'calm'", "rough"]),
         ({"set": ("rough",)}, ["NAME=VALUE", "'rough'"]),

@@ -134,7 +134,7 @@ def in_process(limit_s, name, *inputs):
     except subprocess.TimeoutExpired:
         return {"failed": f"did not end in {limit_s:.0f} s"}
     if run.returncode:
-        return {"failed": run.stderr.strip().splitlines()[-1][:120]}
+        return {"failed": (run.stderr.strip().splitlines() or [f"exit code {run.returncode}"])[-1][:120]}
     return json.loads(run.stdout.splitlines()[-1])
 
 
@@ -218,7 +218,7 @@ def run_peer(args, words):
     command = [args.peers, "tools/peers.py", *words]
     run = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False, env=os.environ)
     if run.returncode:
-        return {"failed": run.stderr.strip().splitlines()[-1][:120]}
+        return {"failed": (run.stderr.strip().splitlines() or [f"exit code {run.returncode}"])[-1][:120]}
     return {"envs": 512} | json.loads(run.stdout.splitlines()[-1])
 
 
