@@ -200,6 +200,20 @@ def test_noise_has_the_stated_width(jitted):
     assert np.std(seen) == pytest.approx(3.0 / 12**0.5, rel=0.05)
 
 
+def test_robots_start_as_their_config_says(jitted):
+    """Of 512 starts: place, heading, load on the base and friction fill their ranges evenly."""
+    env, state = jitted("go1_loco").env, jitted("go1_loco").start(512)
+    c, physics = env.config, jax.device_get(state.physics)
+    load = (physics.mass_scale[:, 1] - 1) * env.model.body_mass[1]
+    yaw = 2 * np.arctan2(physics.qpos[:, 6], physics.qpos[:, 3])
+    drawn = [(physics.qpos[:, i], -c.spawn_xy, c.spawn_xy) for i in (0, 1)]
+    drawn += [((yaw + np.pi) % (2 * np.pi) - np.pi, -c.spawn_yaw, c.spawn_yaw), (load, *c.added_mass)]
+    for values, low, high in drawn:
+        assert high > low
+        got = (np.quantile(values, [0, 0.25, 0.5, 0.75, 1]) - low) / (high - low)
+        np.testing.assert_allclose(got, [0, 0.25, 0.5, 0.75, 1], atol=0.08)
+
+
 def overturned(state):
     """The first robot lies on its back, the others stand."""
     flipped = state.physics.qpos.at[0, 3:7].set(jnp.array([0.0, 1, 0, 0])).at[0, 2].set(0.05)
@@ -279,14 +293,17 @@ def test_command_changes_when_due(jitted):
 
 def test_shares_and_ranges_of_commands():
     """Of 20 000 draws the shares that the config states stand, turn on the spot or turn at a rate; times are even."""
-    env = envs.make("go1_loco", "c", standing=0.1, turning=0.3, on_the_spot=0.15, command_seconds=(3.0, 8.0))
+    ranges = {"command_seconds": (3.0, 8.0), "lin_vel_x": (-0.5, 1.5), "lin_vel_y": (-0.3, 0.7)}
+    env = envs.make("go1_loco", "c", standing=0.1, turning=0.3, on_the_spot=0.15, **ranges)
     drawn = jax.device_get(jax.vmap(env.draw_command)(jax.random.split(jax.random.key(0), 20_000)))
     spot, rate = np.all(drawn["command"][:, :2] == 0, axis=1), ~drawn["steers"]
     shares = [np.mean(~drawn["moves"]), np.mean(rate & spot), np.mean(rate & ~spot), np.mean(rate & ~drawn["moves"])]
     np.testing.assert_allclose(shares, [0.1, 0.15, 0.3, 0.045], atol=0.012)
     assert not np.any(spot & ~rate), "who turns to a heading walks"
-    seconds, turn = drawn["remaining"] * env.dt, drawn["command"][:, 2]
-    for values, low, high in ((seconds, 3, 8), (turn[rate], -1, 1), (drawn["heading"], -np.pi, np.pi)):
+    seconds, (x, y, turn) = drawn["remaining"] * env.dt, drawn["command"].T
+    drawn_from = (seconds, 3, 8), (turn[rate], -1, 1), (drawn["heading"], -np.pi, np.pi)
+    assert abs(np.corrcoef(x[~spot], y[~spot])[0, 1]) < 0.05
+    for values, low, high in (*drawn_from, (x[~spot], -0.5, 1.5), (y[~spot], -0.3, 0.7)):
         np.testing.assert_allclose(np.quantile(values, [0, 0.5, 1]), [low, (low + high) / 2, high], atol=0.1)
 
 
@@ -719,6 +736,15 @@ def test_mirrored_rollout_is_seen_mirrored(paced, task):
             np.testing.assert_allclose(image.reward, state.reward, atol=1e-4)
 
 
+def test_the_clock_turns_over_where_images_are_half_a_step_apart():
+    """Front and hind feet of a hexapod are in phase, its left and right feet are not."""
+    left_right, front_back = np.array([3, 4, 5, 0, 1, 2]), np.array([2, 1, 0, 5, 4, 3])
+    hexapod = SimpleNamespace(gait=(0, 0.5, 0, 0.5, 0, 0.5))
+    for image, turns in ((left_right, True), (front_back, False)):
+        hexapod.mirror_feet = lambda _, image=image: image
+        assert envs.base.Env.swaps_steps(SimpleNamespace(robot=hexapod), "") == turns
+
+
 @pytest.mark.parametrize("task", TASKS)
 def test_mirrors_are_involutions(jitted, task):
     env = jitted(task).env
@@ -805,6 +831,19 @@ REFUSALS = [
     ("go1_loco", "noise", "1if", "noise takes a number like 0.5, not '1if'"),
     ("go1_loco", "noise", "open('x')", "noise takes a number like 0.5, not"),
     ("go1_loco", "noise", "[" * 9999, "noise takes a number like 0.5, not"),
+    ("go1_loco", "noise", "-1", "noise must be from 0 to inf, not -1.0"),
+    ("go1_loco", "spawn_velocity", "-0.5", "spawn_velocity must be from 0 to inf"),
+    ("go1_loco", "friction", "-1,0.5", "friction must be from 0 to inf"),
+    ("go1_loco", "push_seconds", "0,0", "push_seconds must be above 0"),
+    ("go1_loco", "standing", "5", "standing must be from 0 to 1, not 5.0"),
+    ("g1_loco", "turning", "0.95", "turning and on_the_spot are shares, together at most 1, not 1.05"),
+    ("g1_loco", "stance", "1", "stance must be from 0.05 to 0.95"),
+    ("go1_loco", "max_tilt", "270", "max_tilt must be from 1 to 180"),
+    ("go1_loco", "reward_floor", "1", "reward_floor must be from -inf to 0"),
+    ("go1_loco", "added_mass", "-30,-20", "added_mass and link_mass leave the base with -2"),
+    ("go1_loco", "episode_seconds", "0.005", "episode_seconds must be at least a control step of 0.02 s"),
+    ("go1_loco", "weights", "{'slip': -0.1}", "weights takes one number at a time, as weights.NAME=0.5"),
+    ("anymal_pedipulation", "box", "(1,0),(0,.5),(-1,1)", "box takes its lower end first"),
     ("go1_loco", "history", "2.5", "history takes a whole number like 4, not '2.5'"),
     ("go1_loco", "history", "0", "history must be above 0, not 0"),
     ("go1_loco", "history", "9" * 5000, "history takes a whole number like 4, not"),

@@ -226,6 +226,17 @@ def test_set_reaches_the_data_and_the_records(tmp_path):
         assert record["config"] == json.loads(json.dumps(config))
 
 
+def test_first_clocks_are_spread():
+    """So that not all episodes reach their time limit together."""
+    args = dataclasses.replace(SMOKE, num_envs=64)
+    env = envs.make_explore("go1", "c")
+    args = script.merge(args, env.config.ppo)
+    net, member = script.ActorCritic((8,), 12, 1.0), script.PIDM(script.MEMBER, 24)
+    opt = optax.scale_by_adam()
+    clocks = np.asarray(script.init_state(args, env, net, opt, member, opt).env.clock)
+    assert clocks.min() < 200 and 800 < clocks.max() < env.episode_steps
+
+
 def test_random_policy_does_not_learn(tmp_path):
     state = script.main(dataclasses.replace(SMOKE, policy="random", run_dir=str(tmp_path / "r")))
     assert float(jnp.exp(state.params["params"]["log_std"]).mean()) == pytest.approx(1.0)
@@ -236,6 +247,8 @@ def test_stages_one_to_three_through_files(collected, tmp_path):
     pidm, run = tmp_path / "pidm", tmp_path / "run"
     pretrain_pidm.main(pretrain_pidm.Args(data=str(collected[0]), preset="smoke", run_dir=str(pidm)))
     args = ppo_finetune.Args(preset="smoke", pretrained=str(pidm / "pidm.msgpack"), run_dir=str(run))
+    _, meta = records.load(pidm / "pidm.msgpack", "PIDM checkpoint")
+    assert meta["action_scale"] == [0.25] * 12 and meta["dt"] == 0.02
     ppo_finetune.main(args)
     _, meta = records.load(run / "policy.msgpack", "policy")
     assert meta["args"]["network"] == "pidm"
@@ -286,7 +299,7 @@ def test_full_disk_is_one_line_and_leaves_no_arrays(tmp_path, refused, monkeypat
     def full(*_):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr(os, "posix_fallocate", full)
+    monkeypatch.setattr(os, "posix_fallocate", full, raising=False)  # macOS has none
     refused(script.main, dataclasses.replace(SMOKE, run_dir=str(tmp_path / "run")), "cannot reserve", "No space left")
     assert not list((tmp_path / "run").glob("*.npy"))
 

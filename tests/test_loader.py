@@ -414,8 +414,13 @@ def test_a_dog_walks_through_its_task(bodies):
 def test_without_contact_ends_only_a_tilt_ends_an_episode(write):
     body = loader.load(write(quadruped(), "contact_ends = []"))
     env = envs.make("loco", "c", robot=body)
-    state = jax.jit(env.reset)(jax.random.key(0))
-    assert not jax.jit(env.step)(state, jnp.zeros(12)).terminated and "only a tilt" in "\n".join(loader.lines(body))
+    state, step = jax.jit(env.reset)(jax.random.key(0)), jax.jit(env.step)
+    assert "only a tilt" in "\n".join(loader.lines(body))
+    for degrees, ends in ((60, False), (80, True)):
+        half = np.deg2rad(degrees) / 2
+        qpos = state.physics.qpos.at[2:7].set(jnp.array([1.0, np.cos(half), np.sin(half), 0, 0]))
+        fallen = step(state.replace(physics=state.physics.replace(qpos=qpos)), jnp.zeros(12))
+        assert bool(fallen.terminated) == ends, degrees
 
 
 def test_weights_follow_the_body(bodies):

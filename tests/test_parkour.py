@@ -163,6 +163,77 @@ def test_height_observation_without_noise(task, started):
             assert state.obs[i, start + 11 * row + column] == pytest.approx(want, abs=5e-3)
 
 
+@pytest.mark.parametrize("mirror", ["left_right", "front_back"])
+def test_scans_are_mirrored_point_by_point(mirror, started):
+    """A point of the mirrored scan holds the reading of the reflected point."""
+    env, _ = started("anymal_crouch", **EXACT)
+    reflection = {"left_right": [1, -1], "front_back": [-1, 1]}[mirror]
+    for kind, grid in parkour.GRIDS.items():
+        perm, sign = env.mirror_block(mirror, kind)
+        points = grid.reshape(-1, 2)
+        np.testing.assert_allclose(points[perm], points * reflection, atol=1e-12)
+        assert np.all(sign == 1)
+
+
+def test_the_ceiling_scan_and_the_shift_of_the_map(started):
+    """What rays meet above each point; a map that is shifted down has both its ground and its ceiling lower."""
+    env, state = started("anymal_crouch", **EXACT)
+    where = env.obs_slices()["ceiling"]
+    sense = jax.jit(lambda motion, task: env.sense(jax.random.key(0), motion, task)[0])
+    seen = 0
+    for i in range(9, N, 10):  # the lowest tables
+        data, one = simulation(env, state, i), jax.tree.map(lambda x, i=i: x[i], state)
+        motion = env.motion(one.physics)
+        base, yaw = data.qpos[:3].copy(), float(motion.yaw)
+        data.qpos[0] = 100.0
+        mujoco.mj_kinematics(env.model, data)
+        for number, (x, y) in enumerate(parkour.CEILING_GRID.reshape(-1, 2)):
+            at = base[0] + np.cos(yaw) * x - np.sin(yaw) * y, base[1] + np.sin(yaw) * x + np.cos(yaw) * y
+            up = ray(env, data, [*at, 0.3], 1.0)
+            want = 1.0 if up < 0 else np.clip(0.3 + up - base[2], 0.0, 1.0)
+            scale = np.broadcast_to(env.OBS["ceiling"][1], where.stop - where.start)[number]
+            assert state.obs[i, where][number] / scale == pytest.approx(want, abs=5e-3)
+            seen += want < 1.0
+        low, flat = (sense(motion, one.task.replace(shift=jnp.array([0.0, 0.0, z]))) for z in (0.05, 0.0))
+        inside = (np.asarray(flat["ceiling"]) > 0.1) & (np.asarray(flat["ceiling"]) < 1.0)
+        np.testing.assert_allclose((low["ceiling"] - flat["ceiling"])[inside], -0.05, atol=1e-5)
+        np.testing.assert_allclose(low["height"] - flat["height"], 0.05, atol=1e-5)
+    assert seen > 0
+
+
+def test_inputs_of_the_task_worked_out_by_hand(one):
+    """A robot that looks 0.7 rad to the left, a goal 2 m ahead and 1 m to its left, a quarter of the time gone."""
+    env, state = one("anymal_climb_up")
+    motion = env.motion(state.physics).replace(base_pos=jnp.array([3.0, -2.0, 0.6]), yaw=jnp.float32(0.7))
+    ahead, left = np.array([np.cos(0.7), np.sin(0.7)]), np.array([-np.sin(0.7), np.cos(0.7)])
+    task = state.task.replace(goal_yaw=jnp.float32(0.7 + 0.4))
+
+    def inputs(forward, sideways, up, clock):
+        goal = jnp.array([*(np.array([3.0, -2.0]) + forward * ahead + sideways * left), 0.6 + up], jnp.float32)
+        return env.task_inputs(task.replace(goal=goal), motion, clock)
+
+    near = inputs(2.0, 1.0, 0.5, env.episode_steps // 4)
+    np.testing.assert_allclose(near["goal"], [2.0, 1.0, 0.5], atol=1e-5)
+    np.testing.assert_allclose(near["heading"], [np.sin(0.4), np.cos(0.4)], atol=1e-6)
+    assert float(near["time_left"]) == pytest.approx(0.75)
+    np.testing.assert_allclose(inputs(6.0, 8.0, 0.0, 0)["goal"], [3.0, 4.0, 0.0], atol=1e-4)  # no farther than 5 m
+
+
+def test_an_episode_starts_with_its_distance_and_a_heading_near_the_goal(started):
+    env, state = started("anymal_climb_up")
+    way = np.asarray(state.task.goal[:, :2] - state.physics.qpos[:, :2])
+    np.testing.assert_allclose(state.task.start_distance, np.hypot(*way.T), rtol=1e-6)
+    turn = np.asarray(state.task.goal_yaw) - np.arctan2(way[:, 1], way[:, 0])
+    assert np.abs(turn).max() <= 0.3 and np.ptp(turn) > 0.3
+    assert np.abs(state.task.shift).max() <= 0.075 and np.all(np.ptp(np.asarray(state.task.shift), axis=0) > 0.1)
+    one = jax.tree.map(lambda x: x[0], state)
+    motion = env.motion(one.physics)
+    xy = env.grid(parkour.HEIGHT_GRID, motion, one.task)
+    seen = motion.base_pos[2] - env.heights(motion.mocap_pos, motion.mocap_quat, xy) - 0.5 + one.task.shift[2]
+    noise = np.asarray(one.obs[env.obs_slices()["height"]] / 2 - seen)[np.abs(seen) < 0.9]
+    assert np.abs(noise).max() <= 0.0501 and noise.min() < -0.04 and noise.max() > 0.04
+
+
 def mirrored_start(env, mirror, state):
     """The same episodes with robot, slabs and goal reflected."""
     polar = jnp.array({"left_right": [1.0, -1, 1], "front_back": [-1.0, 1, 1]}[mirror])
@@ -340,6 +411,7 @@ def test_a_robot_that_holds_its_pose_succeeds_and_one_on_its_belly_does_not(calm
         state = task.step(state, action)
     assert np.asarray(state.truncated).all() and np.asarray(state.metrics["goal_distance"] < 0.5).all()
     np.testing.assert_array_equal(state.metrics["episode_success"], [1.0, 0.0])
+    np.testing.assert_array_equal(state.task.level, [1, 0])
 
 
 def test_standing_up_at_the_goal_pays_at_every_step(climb_up):

@@ -194,6 +194,45 @@ def test_error_falls_on_a_linear_system(pretrained):
         assert (pretrained / name).stat().st_size > 5000
 
 
+def test_validation_sees_noise_and_compares_with_the_present(folder):
+    """Predictions differ from those without noise; the last action and the change of the joints are those of t."""
+    data, env = script.open_data(script.Args(data=str(folder)))
+    net, index = script.PIDM(script.SIZES["go1"], A), data.validation[:20]
+    windows = data.windows(index)
+    variables = script.init_variables(script.Args(noise=0.0), env, net, windows)
+    noisy, quiet = (
+        script.predict_all(script.Args(noise=noise), env, net, variables, data, index) for noise in (1.0, 0.0)
+    )
+    np.testing.assert_allclose(quiet["predicted"], script.predict(net, variables, windows), atol=1e-5)
+    assert np.abs(noisy["predicted"] - quiet["predicted"]).max() > 1e-3
+    for outcome in (noisy, quiet):
+        np.testing.assert_array_equal(outcome["last"], windows["past"][:, -1])
+        change = 0.25 * windows["action"] - windows["prop"][:, -1, 6:18]
+        np.testing.assert_allclose(outcome["change"], change, atol=1e-6)
+
+
+def test_training_samples_are_of_training_environments_alone(folder, tmp_path, monkeypatch):
+    """As many as --num-samples asks for, each once. Their statistics are of noisy readings."""
+    seen, run_epoch, make_normalizer = [], script.run_epoch, script.make_normalizer
+    norms = []
+
+    def watched(args, data, index, *rest):
+        seen.append((index, data))
+        return run_epoch(args, data, index, *rest)
+
+    def kept(*parts):
+        norms.append(make_normalizer(*parts))
+        return norms[-1]
+
+    monkeypatch.setattr(script, "run_epoch", watched)
+    monkeypatch.setattr(script, "make_normalizer", kept)
+    script.main(script.Args(data=str(folder), preset="smoke", num_samples=60, run_dir=str(tmp_path / "run")))
+    index, data = seen[0]
+    assert len(index) == len({*index}) == 60 and {*index} <= {*data.train.tolist()}
+    variance = np.square(norms[-1]["prop_std"])[18:]  # of joint velocities, whose noise is even within 1.5
+    assert np.mean(variance) == pytest.approx(1 + 1.5**2 / 3, rel=0.1)
+
+
 @pytest.fixture
 def step_sizes(monkeypatch):
     """Step sizes that trainings take, in order."""
@@ -234,7 +273,7 @@ def test_the_step_size_falls_once_three_epochs_bring_nothing(errors, starts):
 
 def test_patience_ends_a_training_which_resumes_to_the_same_weights(folder, tmp_path, monkeypatch, step_sizes):
     """Errors that fall for three epochs only: two more at --lr, two in which it falls. Killed in each, it goes on."""
-    made_up, killed, run_epoch, errors = [5, 4, 3, 3, 3, 2, 1, 1], [], script.run_epoch, script.errors
+    made_up, killed, run_epoch, errors = [5, 4, 3, 3, 3, 2, 4, 1], [], script.run_epoch, script.errors
     past = []
 
     def killable(*parts):
@@ -249,7 +288,7 @@ def test_patience_ends_a_training_which_resumes_to_the_same_weights(folder, tmp_
     script.main(args)
     whole = records.load(tmp_path / "whole/pidm.msgpack", "PIDM checkpoint")
     sizes, per_epoch = [*step_sizes], len(step_sizes) // 7
-    assert len(sizes) == 7 * per_epoch and whole[1]["metrics"]["iteration"] == 7
+    assert len(sizes) == 7 * per_epoch and whole[1]["metrics"]["iteration"] == 6, "the best epoch is kept"
     assert sizes[: 5 * per_epoch] == [np.float32(args.lr)] * 5 * per_epoch
     assert sizes[-2 * per_epoch] == np.float32(args.lr) and sizes[-1] < 0.6 * args.lr
     killed[:], step_sizes[:] = range(1, 7), []
@@ -329,12 +368,15 @@ def test_a_robot_without_a_shipped_checkpoint(pretrained, jitted, tmp_path, monk
     """Its policy goes on as it was; a random PIDM is told where its input scaling can come from."""
     env, policy = jitted("go1_loco").env, tmp_path / "policy.msgpack"
     net, _, saved = start(env, pretrained=str(pretrained / "pidm.msgpack"))
+    calm = saved["params"] | {"log_std": saved["params"]["log_std"] - 1}  # as after a training
+    saved = saved | {"params": calm}
     records.save(policy, saved, {"task": "go1_loco", "args": {}})
     monkeypatch.setattr(finetune, "SHIPPED", tmp_path)
     args = finetune.Args(preset="smoke", network="pidm", policy=str(policy))
     state = finetune.init_state(finetune.merge(args, env.config.ppo), env, net, finetune.optax.scale_by_adam())
     for part in ("actor", "critic"):
         jax.tree.map(np.testing.assert_array_equal, state.params["params"][part], saved["params"][part])
+    np.testing.assert_allclose(state.params["params"]["log_std"], calm["log_std"] + 1, err_msg="it explores anew")
     with pytest.raises(records.UserError, match="--load-into none"):
         start(env)
     other = finetune.Args(pretrained=str(pretrained / "pidm.msgpack"), load_into="none")

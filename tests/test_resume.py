@@ -85,6 +85,13 @@ def test_resumed_run_has_the_same_bits(script, whole, tmp_path, monkeypatch):
     jax.tree.map(np.testing.assert_array_equal, *(weights_of(folder / RESULT[script]) for folder in (want, broken)))
 
 
+def test_the_time_before_a_resume_counts(tmp_path):
+    one = run.Run(ppo_finetune.Args(run_dir=str(tmp_path)), None, 10, ())
+    one.rows = [[{"seconds": 100.0}]]
+    with one:
+        assert 100 <= one.seconds() < 200
+
+
 def test_full_disk_ends_in_one_line_and_loses_nothing(whole, tmp_path, refused, monkeypatch):
     """The disk is full when the second row is written: one line; with room again --resume ends with the same bits."""
     want, args = whole(ppo_finetune)

@@ -314,6 +314,7 @@ def test_terms_and_rewards_over_a_rollout(jitted, name):
     weights = {term: weight for term, weight in WEIGHTS.get(name, env.config.weights).items() if weight}
     floor, failure = LIMITS[name.removesuffix(" robust")]
     memories = [Memory(env, state.physics.qpos[n], state.physics.qvel[n]) for n in range(ROBOTS)]
+    returns = np.zeros(ROBOTS)
     for i in range(STEPS):
         action = rng.normal(size=(ROBOTS, env.action_dim)).astype(np.float32)
         before = jax.device_get(state.replace(key=None))
@@ -333,9 +334,15 @@ def test_terms_and_rewards_over_a_rollout(jitted, name):
             total = sum(weights[term] * value for term, value in terms.items())
             want = max(total, floor) * DT + failure * after.terminated[n]
             np.testing.assert_allclose(after.reward[n], want, rtol=1e-3, atol=1e-5)
+            returns[n] += want
+            np.testing.assert_allclose(after.metrics["episode_return"][n], returns[n], rtol=1e-2, atol=1e-3)
+            if CASES[name] is locomotion:
+                off = told.command - [*now.lin_vel[:2], now.ang_vel[2]]
+                errors = [after.metrics[metric][n] for metric in ("lin_vel_error", "yaw_rate_error")]
+                np.testing.assert_allclose(errors, [np.hypot(*off[:2]), abs(off[2])], rtol=1e-3, atol=1e-4)
             memory.actions.append(action[n])
             if after.terminated[n] or after.truncated[n]:
-                memories[n] = Memory(env, after.physics.qpos[n], after.physics.qvel[n])
+                memories[n], returns[n] = Memory(env, after.physics.qpos[n], after.physics.qvel[n]), 0.0
                 resets += 1
     assert seen == weights.keys(), f"never nonzero: {weights.keys() - seen}"
     assert resets >= 2

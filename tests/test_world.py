@@ -49,6 +49,9 @@ STRANGE = {  # each of these once ended a training, or changed its numbers
 }
 needs_locks = pytest.mark.skipif(not records.fcntl, reason="no file locks on this system")
 needs_git = pytest.mark.skipif(not shutil.which("git"), reason="no git on this machine")
+# For git in a test: not the repository that calls the tests from a hook, nor a user's settings, such as signing.
+PLAIN_GIT = {name: value for name, value in os.environ.items() if not name.startswith("GIT_")}
+PLAIN_GIT |= {"GIT_CONFIG_GLOBAL": os.devnull, "GIT_CONFIG_NOSYSTEM": "1"}
 
 
 @pytest.fixture(scope="module")
@@ -125,7 +128,7 @@ def test_the_commit_is_that_of_the_project(tmp_path, monkeypatch):
     """Whatever repository is around the working directory, a copy of the project, or in GIT_DIR."""
 
     def git(*words):
-        subprocess.run(["git", "-C", tmp_path, *words], check=True, capture_output=True)
+        subprocess.run(["git", "-C", tmp_path, *words], env=PLAIN_GIT, check=True, capture_output=True)
 
     here = records.commit()
     git("init")
@@ -147,7 +150,7 @@ def test_a_checkout_with_letters_beyond_ascii_has_a_commit(tmp_path):
     shutil.copytree(ROOT / "envs", tmp_path / "ü/envs", ignore=shutil.ignore_patterns("*.obj", "*.stl", "*.png"))
     shutil.copytree(ROOT / "assets", tmp_path / "ü/assets", ignore=shutil.ignore_patterns("pidm"))
     for words in (["init"], ["-c", "user.name=a", "-c", "user.email=a@b.c", "commit", "--allow-empty", "-m", "x"]):
-        subprocess.run(["git", "-C", tmp_path / "ü", *words], check=True, capture_output=True)
+        subprocess.run(["git", "-C", tmp_path / "ü", *words], env=PLAIN_GIT, check=True, capture_output=True)
     environ = os.environ | {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
     code = "from experiment import records; print(records.commit())"
     process = subprocess.run(
