@@ -1,4 +1,6 @@
-"""Train tasks as the README's table reports them, evaluate, and keep the small files in results/tasks/<task>.
+"""Train tasks from scratch with a preset, evaluate, and replace what results/tasks/<task> holds.
+
+The recorded G1, robust policies and parkour, but for crouching, were made in several trainings: docs/ppo_finetune.md.
 
     python results/tasks.py --tasks anymal_climb_up anymal_jump
     python results/tasks.py --tasks anymal_climb_up --stages look
