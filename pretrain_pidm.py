@@ -382,7 +382,8 @@ def open_data(args):
 
 def checkpoint_meta(args, env, data, sizes, row):
     """Description of a PIDM checkpoint, stored in it."""
-    meta = {name: data.meta.get(name) for name in ("robot", "layout", "history", "action_scale", "dt")}
+    meta = {name: data.meta[name] for name in ("robot", "layout", "history")}
+    meta |= {"action_scale": list(env.robot.action_scale), "dt": env.dt}
     meta["dataset"] = {name: data.meta[name] for name in ("transitions", "args", "versions")}
     return meta | {"body": env.config.body, "sizes": dict(sizes), "args": dataclasses.asdict(args), "metrics": row}
 

@@ -57,7 +57,9 @@ class Config:
         for name, (least, most) in LIMITS.items():
             value = getattr(self, name, least)
             if np.min(value) < least or np.max(value) > most:
-                raise ValueError(f"{name} must be from {least:g} to {most:g}, not {value}")
+                limits = f"at least {least:g}" if most == np.inf else f"from {least:g} to {most:g}"
+                limits = f"at most {most:g}" if least == -np.inf else limits
+                raise ValueError(f"{name} must be {limits}, not {value}")
 
 
 POSITIVE = (

@@ -176,7 +176,8 @@ def read_wishes(path):
         raise ValueError(f'{toml} names no file; add file = "robot.xml"')
     if path == toml:
         return toml.parent / wishes["file"], wishes
-    return path, wishes if wishes.get("file", path.name) == path.name else {}
+    here = (path.parent / wishes.get("file", path.name)).resolve() == path.resolve()
+    return path, wishes if here else {}
 
 
 def wished(value, joints, otherwise):

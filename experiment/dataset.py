@@ -127,7 +127,9 @@ def robot_of(meta):
 def env_of(folder, meta):
     """Environment of a collection's robot. UserError if the robot, x or the scale of actions is another one today."""
     try:
-        env = envs.make_explore(robot_of(meta), "c", history=meta["history"])
+        config = meta["config"] if isinstance(meta.get("config"), dict) else {}
+        same = {name: config[name] for name in ("physics_dt", "decimation") if name in config}
+        env = envs.make_explore(robot_of(meta), "c", history=meta["history"], **same)
         scale = np.broadcast_to(np.array(meta.get("action_scale", env.robot.action_scale), float), env.action_dim)
     except (ValueError, KeyError, TypeError) as error:
         raise records.UserError(f"{folder}/meta.json is damaged: {error!r}; collect the data again") from None

@@ -55,7 +55,7 @@ def each_seed(args):
 
 
 class Run:
-    """Folders and rows of one run. On hosts other than the first, rows are kept but nothing is written."""
+    """Folders and rows of one run. Processes but the first keep rows and write nothing."""
 
     def __init__(self, args, config, total, shown, over="env_steps"):
         """args and config are recorded in args.json; total: iterations of the run; for the rest see Progress."""
@@ -158,7 +158,7 @@ class Run:
             self.save(unstack(states))
 
     def save(self, states):
-        """Write what --resume needs, a state for each seed. Skipped on several hosts: none holds the whole state."""
+        """Write what --resume needs, a state for each seed. Skipped with several processes: none holds all."""
         if jax.process_count() == 1:
             for folder, state, rows in zip(self.folders, states, self.rows, strict=True):
                 records.save_state(folder, state, rows)

@@ -45,7 +45,7 @@ EARLY = 100  # iterations of a task's training whose states the coverage figure 
 
 @dataclass(frozen=True)
 class Args:
-    robots: tuple[Literal["go1", "anymal_d", "g1"], ...] = ("go1", "anymal_d", "g1")
+    robots: tuple[str, ...] = ("go1", "anymal_d", "g1")
     stages: tuple[Literal["collect", "pretrain", "validate", "look", "features", "sizes"], ...] = (
         "collect",
         "pretrain",
@@ -347,24 +347,31 @@ def write_readme():
     records.replace_text(ROOT / "results/pidm/README.md", head + "\n".join(lines).rstrip() + "\n")
 
 
+def make(robot, stages):
+    """Run these stages for a robot."""
+    if "collect" in stages:
+        recording.run_script(["ppo_explore.py", "--robot", robot, "--force", *EXPLORE])
+    if "pretrain" in stages:
+        words = ("--data", f"runs/explore/{robot}/seed0", "--force", *PRETRAIN)
+        recording.run_script(["pretrain_pidm.py", *words])
+        keep(robot)
+    if "validate" in stages:
+        validate(robot)
+    if "look" in stages:
+        look(robot)
+    if "features" in stages:
+        found = compare_features(robot, robot.removesuffix("_d") + "_loco")
+        records.replace_text(ROOT / f"results/pidm/{robot}/features.json", json.dumps(found, indent=1) + "\n")
+    if "sizes" in stages:
+        pretrain_on_parts(robot)
+
+
 def main(args):
     devices.find()
+    if unknown := {*args.robots} - envs.EXPLORE.keys():
+        raise records.UserError(f"unknown robot {unknown.pop()!r}; choose of {', '.join(envs.EXPLORE)}")
     for robot in args.robots:
-        if "collect" in args.stages:
-            recording.run_script(["ppo_explore.py", "--robot", robot, "--force", *EXPLORE])
-        if "pretrain" in args.stages:
-            words = ("--data", f"runs/explore/{robot}/seed0", "--force", *PRETRAIN)
-            recording.run_script(["pretrain_pidm.py", *words])
-            keep(robot)
-        if "validate" in args.stages:
-            validate(robot)
-        if "look" in args.stages:
-            look(robot)
-        if "features" in args.stages:
-            found = compare_features(robot, robot.removesuffix("_d") + "_loco")
-            records.replace_text(ROOT / f"results/pidm/{robot}/features.json", json.dumps(found, indent=1) + "\n")
-        if "sizes" in args.stages:
-            pretrain_on_parts(robot)
+        make(robot, args.stages)
     write_readme()
 
 

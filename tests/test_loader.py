@@ -147,7 +147,8 @@ def test_robot_toml_goes_before_the_file(write):
 def test_a_robot_toml_of_another_file_does_not_count(write):
     plain, other = (loader.load(write(quadruped(), toml)) for toml in ("", 'file = "a1.xml"\nkp = 99.0'))
     assert other == plain
-    assert set(loader.load(write(quadruped(), 'file = "dog.xml"\nkp = 99.0'))["kp"]) == {99.0}
+    for name in ("dog.xml", "./dog.xml"):
+        assert set(loader.load(write(quadruped(), f'file = "{name}"\nkp = 99.0'))["kp"]) == {99.0}
 
 
 def test_rotors_are_those_of_joint_and_motor(write):

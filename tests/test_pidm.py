@@ -211,6 +211,16 @@ def test_validation_sees_noise_and_compares_with_the_present(folder):
         np.testing.assert_allclose(outcome["change"], change, atol=1e-6)
 
 
+def test_data_of_another_time_step_make_a_pidm_of_that_time_step(folder, tmp_path, refused):
+    """Its own data validate it; a task with steps of 0.02 s refuses it."""
+    data = random_dataset(tmp_path / "slow", config={"decimation": 8, "physics_dt": 0.005})
+    script.main(script.Args(data=str(data), preset="smoke", run_dir=str(tmp_path / "run")))
+    pidm = str(tmp_path / "run/pidm.msgpack")
+    assert records.load(tmp_path / "run/pidm.msgpack", "PIDM checkpoint")[1]["dt"] == 0.04
+    script.main(script.Args(data=str(data), eval=pidm))
+    refused(script.main, script.Args(data=str(folder), eval=pidm), "dt 0.04, here is dt 0.02")
+
+
 def test_training_samples_are_of_training_environments_alone(folder, tmp_path, monkeypatch):
     """As many as --num-samples asks for, each once. Their statistics are of noisy readings."""
     seen, run_epoch, make_normalizer = [], script.run_epoch, script.make_normalizer
@@ -603,6 +613,7 @@ def test_bad_datasets_are_refused(tmp_path, refused):
     check(random_dataset(tmp_path / "d", layout=["gravity"]), "gravity")
     check(random_dataset(tmp_path / "e", validation_envs=[]), "validation")
     check(random_dataset(tmp_path / "f", action_scale=0.5), "action_scale = [0.5", "not [0.25")
+    assert script.open_data(script.Args(data=str(random_dataset(tmp_path / "h", action_scale=0.25))))
     check(random_dataset(tmp_path / "g", config={"body": {"x": 1}}), "meta.json is damaged")
 
 
