@@ -31,15 +31,15 @@ class Args:
     """One policy, and at most one of --video, --viewer, --web and --export."""
 
     policy: tyro.conf.Positional[str]  # a policy.msgpack of ppo_finetune.py
-    episodes: int = 64  # of the evaluation, at each level where the task has levels
-    level: int | None = None  # of an obstacle course, 0 to 9; None: evaluate all, show level 4
+    episodes: int = 64  # episodes of the evaluation, at each level where the task has levels
+    level: int | None = None  # level of an obstacle course, 0 to 9; None: evaluate all, show level 4
     set: tuple[str, ...] = ()  # NAME=VALUE of the task's config, e.g. friction=0.3,0.3 noise=0
     engine: str = "auto"  # physics: c (CPU threads), mjx (accelerators), warp (NVIDIA)
     video: str | None = None  # film a whole episode as this .gif or .mp4
     viewer: bool = False  # watch and steer the robot in a window
     web: bool = False  # watch and steer it in a browser
     host: str = "127.0.0.1"  # address that --web listens on; 0.0.0.0: all of this machine's
-    port: int = 8080  # of --web
+    port: int = 8080  # port that --web listens on
     export: str | None = None  # write the policy as this ONNX file
 
 
@@ -47,7 +47,7 @@ class Args:
 
 
 def load_policy(path, engine="auto", overrides=(), **fields):
-    """Environment, network, parameters and meta of a policy file; UserError if it is none, or of another version.
+    """Build environment, network, parameters and meta from a policy file. UserError if it is none or does not fit.
 
     The environment has the --set of the training, then `fields` of its config, then `overrides` (NAME=VALUE).
     """
@@ -64,7 +64,7 @@ def load_policy(path, engine="auto", overrides=(), **fields):
 
 
 def load(args, kind="EVALUATION_FIELDS", **fields):
-    """`load_policy` of the arguments, in the task's environment for an evaluation or, SHOWCASE_FIELDS, for pictures."""
+    """Load the policy for evaluation or, with SHOWCASE_FIELDS, for pictures. UserError if task or level is unknown."""
     _, meta = records.load(Path(args.policy), "policy")
     family = envs.family(meta["task"])
     if family is None:
@@ -82,9 +82,9 @@ def load(args, kind="EVALUATION_FIELDS", **fields):
 
 
 def evaluate(env, net, params, episodes, level=None):
-    """One episode per environment with the mean action, fixed seed. Metrics; of the first: its start, qpos (steps, nq).
+    """Run an episode per environment with the mean action, seed fixed. Metrics; start, qpos (steps, nq) of the first.
 
-    The pose of the step that ends the first episode is repeated to the last step.
+    Once the first episode is over, qpos repeats the pose before the step that ended it.
     """
 
     def step(carry, _):
@@ -235,7 +235,7 @@ def export_onnx(args):
         "action_scale": list(env.robot.action_scale),  # [rad] a unit of action
         "kp": env.model.actuator_gainprm[:, 0].tolist(),  # [N m / rad]
         "kd": env.model.dof_damping[6:].tolist(),  # [N m s / rad]; the MJCF has it as damping of the joints
-        "torque_limit": env.model.actuator_forcerange[:, 1].tolist(),  # [N m] of the kp part
+        "torque_limit": env.model.actuator_forcerange[:, 1].tolist(),  # [N m] bounds the kp part; damping comes on top
         "history": env.config.history,
         "prop": list(env.prop_layout),
         **({"mjcf": env.config.body["mjcf"]} if env.config.body else {}),  # of a robot from a file

@@ -52,9 +52,9 @@ class Args:
     validation: float = 0.08  # share of environments held out (paper: 600 k of 7.6 M samples)
     # --- Exploration ---
     policy: Literal["explore", "random"] = "explore"  # random: the initial policy throughout, for comparison
-    disagreement_coef: float = 2.0  # reward per second of the mean disagreement; must exceed the regularisers' cost
-    members: int = 5  # of the ensemble, M
-    buffer_rollouts: int = 8  # that the ring buffer holds: R = N * T * buffer_rollouts
+    disagreement_coef: float = 2.0  # reward per second at the mean disagreement; must exceed the regularisers' cost
+    members: int = 5  # M networks in the ensemble
+    buffer_rollouts: int = 8  # rollouts in the ring buffer, which holds R = N * T * buffer_rollouts transitions
     ensemble_steps: int = 8  # gradient steps per iteration
     ensemble_batch: int = 512  # bootstrap sample of each member and step
     ensemble_lr: float = 1e-3  # Adam step size of the ensemble
@@ -63,17 +63,17 @@ class Args:
     init_std: float | None = None  # initial action std [action units]
     # --- PPO (see ppo_finetune.py) ---
     num_epochs: int = 5  # passes over each rollout
-    num_minibatches: int = 4  # of a pass; each has B = N * T / num_minibatches samples
+    num_minibatches: int = 4  # minibatches of a pass, each of B = N * T / num_minibatches samples
     lr: float = 1e-3  # initial Adam step size, adapted to the KL
     desired_kl: float = 0.01  # the step size keeps the KL from the rollout's policy within a factor 2 of this
     max_lr: float = 1e-2  # largest step size
     gamma: float = 0.99  # discount per control step
     gae_lambda: float = 0.95  # bias/variance trade-off of the advantage
-    clip: float = 0.2  # of the probability ratio and of the value
+    clip: float = 0.2  # bound on the change of the probability ratio and of the value
     value_coef: float = 1.0  # weight of the value loss
     entropy_coef: float | None = None  # weight of the entropy bonus
     mirror_coef: float = 0.1  # weight of the mirror loss
-    max_grad_norm: float = 1.0  # of actor and critic, each
+    max_grad_norm: float = 1.0  # norm to which the gradients of actor and critic are clipped, each on its own
     # --- Devices ---
     distributed: bool = False  # this is one of several processes, see docs/speed.md; process 0 writes the files
     shuffle_blocks: int | None = None  # shuffle samples within this many groups of environments; None: 1 per device
@@ -244,7 +244,7 @@ def statistics(batch):
 
 
 def nll(member, params, norm, batch):
-    """Gaussian negative log-likelihood, without its constant, of members on batches of their own, (M, B, ...) -> ()."""
+    """Gaussian negative log-likelihood without its constant: (M, B, ...) -> (), mean over a batch, sum over members."""
 
     def one_member(params, batch):
         mean, log_var = predict(member, jax.tree.map(lambda x: x[None], params), norm, batch)
@@ -259,7 +259,7 @@ def bootstrap_indices(key, shape, filled):
 
 
 def retrain(args, member, opt, ensemble, buffer, filled, key):
-    """Fit every member to bootstrap samples of the ring buffer, whose first `filled` entries hold data."""
+    """Fit every member to bootstrap samples of the buffer, whose first `filled` rows hold data. Also the mean loss."""
     k_norm, k_fit = jax.random.split(key)
     norm = statistics(jax.tree.map(lambda x: x[bootstrap_indices(k_norm, (4096,), filled)], buffer))
 
@@ -461,7 +461,7 @@ def minibatches(args, key, samples):
 
 
 def update(args, env, net, opt, state, batch, key):
-    """E epochs of minibatch steps on one rollout (Rollout, advantage, return). Returns the state and mean losses."""
+    """Take num_epochs passes over one rollout (Rollout, advantage, return). Returns the state and mean losses."""
     roll, advantage, ret = batch
     advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
     log_std_old = state.params["params"]["log_std"]

@@ -34,7 +34,7 @@ class Args:
 
     # --- Experiment ---
     task: str = "go1_loco"  # a name in envs.TASKS, or loco with --robot
-    robot: str | None = None  # MJCF or URDF file of the robot of --task loco; or a run's args.json
+    robot: str | None = None  # for --task loco: an MJCF, URDF or .toml file, or a run's args.json
     network: Literal["mlp", "pidm"] | None = None  # of actor and critic; None: pidm with --pretrained, else mlp
     pretrained: str | None = None  # PIDM checkpoint written by pretrain_pidm.py
     policy: str | None = None  # start from this policy.msgpack, of the same network and observation
@@ -64,17 +64,17 @@ class Args:
     init_std: float | None = None  # initial action std [action units]
     # --- PPO, as in rsl_rl, a fork of which the paper used ---
     num_epochs: int = 5  # passes over each rollout
-    num_minibatches: int = 4  # of a pass; each has B = N * T / num_minibatches samples
+    num_minibatches: int = 4  # minibatches of a pass, each of B = N * T / num_minibatches samples
     lr: float = 1e-3  # initial Adam step size, adapted to the KL
     desired_kl: float | None = None  # the step size keeps the KL from the rollout's policy within a factor 2 of this
     max_lr: float = 1e-2  # largest step size; at large batches a deep critic may want less
     gamma: float = 0.99  # discount per control step
     gae_lambda: float = 0.95  # bias/variance trade-off of the advantage
-    clip: float = 0.2  # of the probability ratio and of the value
+    clip: float = 0.2  # bound on the change of the probability ratio and of the value
     value_coef: float = 1.0  # weight of the value loss
     entropy_coef: float | None = None  # weight of the entropy bonus
     mirror_coef: float = 0.1  # weight of the mirror loss; ours, the paper gives no number
-    max_grad_norm: float = 1.0  # of actor and critic, each
+    max_grad_norm: float = 1.0  # norm to which the gradients of actor and critic are clipped, each on its own
     distributed: bool = False  # this is one of several processes, see docs/speed.md; process 0 writes the files
     shuffle_blocks: int | None = None  # shuffle samples within this many groups of environments; None: 1 per device
 
@@ -150,7 +150,7 @@ def flat_history(norm, prop, action):
 
 
 # >>> copy: sizes (owner: pretrain_pidm.py)
-SIZES = {  # layer widths of the PIDM's parts, but for the output; ours, for the paper gives the numbers of layers
+SIZES = {  # layer widths of the PIDM's parts, without the output layer; our choice: the paper counts the layers alone
     "anymal_d": {"history": (128, 64), "goal": (64, 32), "backbone": (192, 192, 192, 64), "head": (64,)},
     "go1": {"history": (128, 64), "goal": (64, 32), "backbone": (192, 192, 192, 64), "head": (64,)},
     "g1": {"history": (224, 96), "goal": (96, 32), "backbone": (224, 224, 224, 64), "head": (64,)},
@@ -161,8 +161,8 @@ SIZES = {  # layer widths of the PIDM's parts, but for the output; ours, for the
 class PIDMBranch(nn.Module):
     """Actor or critic around a PIDM (paper Sec. IV-E, Fig. 3).
 
-    The intention encoder, of the observation, takes the place of the delta encoder. A synthesizer, which also sees the
-    intention, takes that of the prediction decoder.
+    An intention encoder, which reads the observation, replaces the delta encoder. A synthesizer, which also sees the
+    encoded intention, replaces the prediction decoder.
     """
 
     sizes: dict
@@ -284,8 +284,8 @@ def shuffle_weights(tree, key):
 def warm_start(args, env, params, key):
     """Set a PIDM's input normalisation and, with --pretrained, load history_encoder and backbone (paper Sec. IV-E).
 
-    --load-into chooses the branches, none for neither; history_encoder loads this part alone. Without --pretrained the
-    normalisation is the shipped one: compared runs differ in weights alone. UserError if of another robot, x or K.
+    --load-into names the branches, or the one part, to load. Without --pretrained the shipped normalisation is used, so
+    that runs differ in weights alone. UserError if the file is missing or of another robot, action scale, dt, x or K.
     """
     path = Path(args.pretrained or SHIPPED / f"{env.robot.name}.msgpack")
     core = {name: params["params"]["actor"][name] for name in ("history_encoder", "backbone")}
@@ -311,7 +311,7 @@ class TrainState:
     opt_state: optax.OptState
     lr: jax.Array  # ()
     env: envs.base.State  # (N, ...)
-    key: jax.Array  # of the seed; stays, for an iteration folds in its number
+    key: jax.Array  # of the seed, never split: each iteration folds in its number
     iteration: jax.Array  # () PPO iterations done
 
 
@@ -346,7 +346,7 @@ def rollout(args, env, net, params, env_state, key):
         action = mean + jnp.exp(log_std) * jax.random.normal(key, mean.shape)
         env_state = jax.vmap(env.step)(env_state, action)  # environments reset themselves
         done = env_state.terminated | env_state.truncated
-        # Deviation (time limits): rsl_rl bootstraps with V of the observation before the step, which is not the last.
+        # Deviation (time limits): rsl_rl bootstraps with V of the observation before the last step, not after it.
         final_value = net.apply(params, net.inputs(env_state.final_obs, env_state.final_history), method=net.value)
         bootstrap = args.gamma * final_value * (env_state.truncated if env.bootstrap_time_outs else 0.0)
         logp = log_prob(mean, log_std, action)
@@ -461,7 +461,7 @@ def minibatches(args, key, samples):
 
 
 def update(args, env, net, opt, state, batch, key):
-    """E epochs of minibatch steps on one rollout (Rollout, advantage, return). Returns the state and mean losses."""
+    """Take num_epochs passes over one rollout (Rollout, advantage, return). Returns the state and mean losses."""
     roll, advantage, ret = batch
     advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
     log_std_old = state.params["params"]["log_std"]
@@ -505,7 +505,7 @@ def iteration(args, env, net, opt, state):
 
 
 def init_state(args, env, net, opt):
-    """New networks, and N environments whose episode clocks start anywhere, so that time-outs spread out."""
+    """New or loaded networks, and N environments at random episode clocks, so that time-outs spread out."""
     key = jax.random.key(args.seed)
     k_net, k_env, k_clock = jax.random.split(key, 3)
     clocks = jax.random.randint(k_clock, (args.num_envs,), 0, env.episode_steps)
@@ -519,7 +519,7 @@ def init_state(args, env, net, opt):
 
 
 def make_chunk(args, env, net, opt, states):
-    """log_every iterations of all seeds' TrainStates (S, ...), which also return their metrics (S, log_every)."""
+    """Compile log_every iterations of all seeds: TrainStates (S, ...) -> the same, and metrics (S, log_every)."""
 
     def one_seed(state):
         return jax.lax.scan(lambda s, _: iteration(args, env, net, opt, s), state, None, args.log_every)

@@ -49,10 +49,10 @@ class Args:
     noise: float = 1.0  # multiplies the tasks' sensor noise
     mirror: bool = True  # mirror half of the samples, for each symmetry of the robot
     # --- Training (ours; the paper gives the L1 loss and 100 epochs) ---
-    epochs: int | None = None  # passes over the data; with --patience at most
-    batch: int | None = None  # B
+    epochs: int | None = None  # passes over the data; with --patience, at most this many
+    batch: int | None = None  # B transitions in a gradient step
     lr: float = 1e-3  # initial Adam step size; falls to 0 along a cosine
-    patience: int | None = None  # lr falls over so many epochs, once as many brought no lower error; None: throughout
+    patience: int | None = None  # after so many epochs without a lower error, lr falls over as many; None: throughout
     # --- Devices ---
     distributed: bool = False  # this is one of several processes, see docs/speed.md; process 0 writes the files
 
@@ -138,7 +138,7 @@ class PIDM(nn.Module):
 
 
 # >>> copy: sizes (owner: pretrain_pidm.py)
-SIZES = {  # layer widths of the PIDM's parts, but for the output; ours, for the paper gives the numbers of layers
+SIZES = {  # layer widths of the PIDM's parts, without the output layer; our choice: the paper counts the layers alone
     "anymal_d": {"history": (128, 64), "goal": (64, 32), "backbone": (192, 192, 192, 64), "head": (64,)},
     "go1": {"history": (128, 64), "goal": (64, 32), "backbone": (192, 192, 192, 64), "head": (64,)},
     "g1": {"history": (224, 96), "goal": (96, 32), "backbone": (224, 224, 224, 64), "head": (64,)},
@@ -190,7 +190,7 @@ class Dataset:
 
 
 def batches(data, index, size):
-    """Yield windows of `size` transitions each, in the order of `index`. A thread gathers the next ones meanwhile."""
+    """Yield the windows of `index`, `size` at a time, sorted within each batch. A thread gathers the next ones."""
 
     def gather(start):
         return data.windows(np.sort(index[start : start + size]))  # sorted: neighbours share pages
@@ -211,7 +211,7 @@ def noise_width(env):
 
 
 def add_noise(key, width, batch):
-    """Add sensor noise to every x of the windows, drawn once for each state: padding repeats that of the first."""
+    """Add sensor noise to every x of the windows, drawn once per state: padding repeats the first state's noise."""
     k_history, k_next = jax.random.split(key)
     prop = batch["prop"] + width * jax.random.uniform(k_history, batch["prop"].shape, minval=-1.0)
     kept = jnp.maximum(jnp.arange(prop.shape[1]), batch["pad"][:, None])
@@ -243,7 +243,7 @@ def augment(args, env, key, batch):
 
 
 def make_normalizer(args, env, key, batch):
-    """Mean and std of x, action and delta_x over windows and all their mirror images, so that mirrors commute."""
+    """Mean and std of x, action and delta_x over windows and their mirror images: mirroring and scaling commute."""
     batch = add_noise(key, args.noise * noise_width(env), batch)
     images = [batch]
     for tables in env.mirrors.values():
@@ -275,9 +275,9 @@ def l1_loss(net, variables, batch):
 
 
 def decay(args, past):
-    """Epochs at which the step size begins to fall and is 0, by the validation errors of past epochs.
+    """Return the epochs at which the step size starts to fall and is 0, given the validation errors of past epochs.
 
-    It falls all the time or, with --patience, once so many epochs brought no lower error, or no more are left.
+    With --patience it starts once so many epochs brought no lower error, or when only so many are left; else at once.
     """
     if args.patience is None:
         return 0, args.epochs
@@ -287,7 +287,7 @@ def decay(args, past):
 
 
 def make_step(args, env, net, opt):
-    """One Adam step on an augmented batch, compiled."""
+    """Return an Adam step, compiled: variables, opt_state, batch (to augment), key, lr -> the first two, loss ()."""
 
     @partial(jax.jit, out_shardings=devices.same())
     def step(variables, opt_state, batch, key, lr):
