@@ -298,7 +298,7 @@ def test_only_marked_places_are_filled():
 def recorded(task, method, scale=None):
     """Indicator (K, R) of recorded runs, read from their rows; a reference that shares nothing with the report."""
     curves = []
-    scale = scale or ("batch" if task in ("anymal_loco", "go1_loco", "g1_loco") else "cpu")
+    scale = scale or ("batch" if task in ("anymal_loco", "go1_loco", "g1_loco", "anymal_climb_up") else "cpu")
     for path in sorted((report.ROOT / f"results/study/{scale}" / task / method).glob("seed*/metrics.csv")):
         with path.open() as file:
             rows = list(csv.DictReader(file))
@@ -309,8 +309,8 @@ def recorded(task, method, scale=None):
 def test_words_of_the_page_are_what_was_recorded():
     """Main numbers of the text, which is written by hand, from the rows alone."""
     text = " ".join((report.ROOT / "results/README.md").read_text().split())
-    ends, there = [], []
-    small = [("anymal_loco", "cpu"), ("go1_loco", "cpu")]  # with 256 environments
+    ends, there, random_ends = [], [], []
+    small = [("anymal_loco", "cpu"), ("go1_loco", "cpu"), ("anymal_climb_up", "cpu")]  # 256 environments; earlier task
     for task, scale in [*((task, None) for task in report.TASKS), *small]:
         arms = [recorded(task, method, scale) for method in ("pidm_pretrained", "pidm_random")]
         final = [arm[:, -max(arm.shape[1] // 20, 1) :].mean() for arm in arms]
@@ -320,17 +320,26 @@ def test_words_of_the_page_are_what_was_recorded():
         )
         ends.append(100 * (final[0] / final[1] - 1))
         there.append(100 * (first[0] / first[1] - 1))
+        random_ends.append(final[1])
         if task == "g1_loco":  # a row every four iterations
             assert f"reaches 50% after {4 * half[0]:.0f} iterations, PIDM random after {4 * half[1]:.0f}" in text
             assert f"and ends {ends[-1]:.1f}% higher, an interval of -4" in text
-    means = [np.mean(every[1:7] + every[8:]) for every in (ends, there)]  # without the rows of 4096
+    means = [np.mean(every[1:7] + every[8:11]) for every in (ends, there)]  # without the rows of 4096
     assert "with both quadrupeds' rows of 256 the means are {:+.1f}% and {:+.1f}%".format(*means) in text
+    means = [np.mean(every[:3] + every[4:9] + every[11:]) for every in (ends, there)]
+    said = "On its earlier task climbing up gained {:.1f}%, with which they were {:+.1f}% and {:+.1f}%".format
+    assert said(ends[11], *means) in text
     ends, there = ends[:9], there[:9]
-    others = [change for change, task in zip(ends, report.TASKS, strict=True) if task != "anymal_climb_up"]
-    assert f"ours without climbing up {np.mean(others):.1f}%" in text
+    parkour = ends[2:7]
+    assert f"final progress is {-min(parkour):.0f}% lower (climbing up) to {max(parkour):.0f}% higher" in text
+    fewer = sorted(-change for change in there[2:7])[1:]
+    assert f"iterations {fewer[0]:.0f} to {fewer[-1]:.0f}% fewer in four of five skills" in text
+    mlp = [recorded(task, "mlp")[:, -max(recorded(task, "mlp").shape[1] // 20, 1) :].mean() for task in report.TASKS]
+    mlp = [100 * (own / base - 1) for own, base in zip(mlp, random_ends[:9], strict=True)]
+    assert f"{np.mean(mlp):.1f}" == f"{np.mean(ends):.1f}" and "but so does the MLP" in text
     assert f"ends {np.mean(ends):.1f}% higher" in text and f"needs {-np.mean(there):.1f}% fewer iterations" in text
     gains = np.array(report.PAPER["to 90%"]["pidm_pretrained"]) < there
-    assert gains.sum() == 8 and "eight of nine gains are smaller" in text
+    assert gains.sum() == 9 and "all nine gains are smaller" in text
     order = stats.spearmanr(there, report.PAPER["to 90%"]["pidm_pretrained"]).statistic
     assert f"(rank correlation {order:.1f})" in text
     last = {m: recorded("anymal_loco", m, "cpu")[:, -4:].mean(1) for m in ("mlp", "pidm_random", "pidm_pretrained")}
@@ -343,6 +352,22 @@ def test_words_of_the_page_are_what_was_recorded():
         recorded("go1_loco", f"pidm_{m}_orthogonal", "batch")[:, -7:].mean() for m in ("pretrained", "random")
     )
     assert f"With 4096 it adds {100 * (with_loaded / without - 1):.1f}% (Go1, n = 1)." in text
+
+
+def test_words_on_climbing_up_are_what_was_recorded():
+    """What mean actions do at each level, 0.1 m and 0.1 m more for each."""
+    text = " ".join((report.ROOT / "results/README.md").read_text().split())
+    folder, shares = report.ROOT / "results/study/batch/anymal_climb_up", {}
+    for method in ("mlp", "pidm_random", "pidm_pretrained"):
+        result = json.loads((folder / method / "seed0/eval.json").read_text())
+        shares[method] = [result[f"level {level}"]["episode_success"] for level in range(10)]
+    mlp, *pidms = shares.values()
+    low, high = sorted(100 * one[2] for one in pidms)
+    assert f"PIDMs get onto 0.3 m in {low:.0f} to {high:.0f}%" in text and max(one[3] for one in pidms) < 0.25
+    assert f"the MLP gets onto 0.4 m in {100 * mlp[3]:.0f}%" in text and max(mlp[4:]) < 0.5
+    random = recorded("anymal_climb_up", "pidm_random")[0]
+    last, before = random[-2:].mean(), random[30:32].mean()  # of 49 rows
+    assert f"{100 * (1 - before / last):.0f}% climbing up" in text
 
 
 @pytest.mark.parametrize("name", ["README.md", "results/README.md", "docs/ppo_finetune.md"])
@@ -496,9 +521,10 @@ def test_words_on_small_steps_are_what_was_recorded():
         half += there[2]
     slow, large = (rows_of("batch")[f"pidm_random{kind}"] for kind in ("_slow", ""))
     jumps = [[max(row["critic_grad_norm"] for row in run[:10]) for run in runs] for runs in (slow, large)]
-    (orthogonal,) = rows_of("batch")["pidm_random_orthogonal"]
-    jumps[0].append(max(row["critic_grad_norm"] for row in orthogonal[:10]))
-    assert max(jumps[0]) < min(jumps[1]) / 10, "the critic stays whole, as with orthogonal weights (Go1, n = 1)"
+    orthogonal = rows_of("batch")["pidm_random_orthogonal"]
+    assert len(orthogonal) == 2, "(n = 1), on both robots"
+    jumps[0] += [max(row["critic_grad_norm"] for row in run[:10]) for run in orthogonal]
+    assert max(jumps[0]) < min(jumps[1]) / 10, "the critic stays whole, as with orthogonal weights (n = 1)"
     assert "ends {:.1f}% (Go1) and {:.1f}% (ANYmal D) higher".format(*ends) in text
     assert "after {:.0f}% and {:.0f}% fewer iterations. The pre".format(*fewer) in text
     assert f"ends {-beyond[0]:.1f}% and {-beyond[1]:.1f}% below that" in text
