@@ -348,10 +348,12 @@ def test_words_of_the_page_are_what_was_recorded():
         recorded("go1_loco", f"pidm_{m}_orthogonal", "cpu")[:, -4:].mean() for m in ("pretrained", "random")
     )
     assert f"costs Go1 {100 * (1 - with_loaded / without):.1f}%" in text
-    with_loaded, without = (
-        recorded("go1_loco", f"pidm_{m}_orthogonal", "batch")[:, -7:].mean() for m in ("pretrained", "random")
-    )
-    assert f"With 4096 it adds {100 * (with_loaded / without - 1):.1f}% (Go1, n = 1)." in text
+    adds = []
+    for task in ("go1_loco", "anymal_loco"):
+        runs = [recorded(task, f"pidm_{m}_orthogonal", "batch") for m in ("pretrained", "random")]
+        assert [len(arm) for arm in runs] == [1, 1], "(n = 1 each)"
+        adds.append(100 * (runs[0][:, -7:].mean() / runs[1][:, -7:].mean() - 1))
+    assert "With 4096 (n = 1 each) it adds {:.1f}% on Go1 and {:.1f}% on ANYmal D.".format(*adds) in text
 
 
 def test_words_on_climbing_up_are_what_was_recorded():
