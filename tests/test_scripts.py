@@ -99,6 +99,22 @@ def test_first_actions_are_small(fresh):
     assert np.abs(net.apply(state.params, {"obs": state.env.obs}, method=net.mean)).max() < 0.1
 
 
+@pytest.mark.parametrize(
+    ("trained", "title"),
+    [
+        ({"network": "mlp", "pretrained": None}, "MLP"),
+        ({"network": "pidm", "pretrained": None}, "random PIDM"),
+        ({"network": "pidm", "pretrained": "x", "load_into": "both"}, "pretrained PIDM"),
+        ({"network": "pidm", "pretrained": "x"}, "pretrained PIDM"),
+        ({"network": "pidm", "pretrained": "x", "load_into": "none"}, "random PIDM"),
+        ({"network": "pidm", "pretrained": "x", "load_into": "shuffled"}, "shuffled PIDM"),
+        ({"network": "pidm", "pretrained": "x", "load_into": "critic"}, "PIDM, pretrained critic"),
+    ],
+)
+def test_pictures_name_what_was_loaded(trained, title, fresh):
+    assert play.title(fresh[0], {"args": trained}) == title
+
+
 def test_first_clocks_are_spread(fresh):
     env, _, state = fresh
     clocks = np.asarray(state.env.clock)

@@ -88,8 +88,8 @@ def repeat(path):
     """Repeat the last step of each dumped robot in plain MuJoCo."""
     try:
         with np.load(path, allow_pickle=False) as file:
-            names = ("qpos", "qvel", "ctrl", "environment", "task", "robot", "set")
-            dump = {"robust": False} | {name: file[name] for name in {*names} | ({"robust"} & {*file.files})}
+            names = ("qpos", "qvel", "ctrl", "environment", "task", "robot", "robust", "set")
+            dump = {name: file[name] for name in names}
         args = ppo_finetune.Args(task=str(dump["task"]), engine="c", set=tuple(dump["set"].tolist()))
         make = partial(envs.make, robust=bool(dump["robust"]), robot=str(dump["robot"]) or None)
         env = make_env(make, args.task, args)
