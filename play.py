@@ -108,6 +108,7 @@ def title(env, meta):
     trained = meta["args"]
     loaded = trained.get("load_into", "both") if trained["pretrained"] else "none"
     names = {"both": "pretrained PIDM", "none": "random PIDM", "shuffled": "shuffled PIDM"}
+    names |= {"none": "PIDM"} if trained.get("policy") else {}  # its first training is not known here
     pidm = names.get(loaded, f"PIDM, pretrained {loaded.replace('_', ' ')}")
     kind = "MLP" if trained["network"] == "mlp" else pidm
     return f"level {env.config.level}, {kind}" if env.LEVELS else kind

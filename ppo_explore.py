@@ -121,7 +121,7 @@ def dense(width, fan_in, gain, weight_init):
 
 
 class MLP(nn.Module):
-    """Dense layers with ELU between them; the last one is linear, its weights scaled by `gain`."""
+    """Dense layers with ELU between them; the last one is linear. Its weights are scaled by `gain` if orthogonal."""
 
     widths: tuple[int, ...]
     gain: float = 2**0.5
@@ -308,7 +308,7 @@ class TrainState:
 # >>> copy: rollout (owner: ppo_finetune.py)
 @flax.struct.dataclass
 class Rollout:
-    inputs: dict  # of the network: obs (T, N, O), prop (T, N, K+1, X), action (T, N, K, A)
+    inputs: dict  # of the network: obs (T, N, O), prop (T, N, K+1, X), past action (T, N, K, A)
     action: jax.Array  # (T, N, A)
     mean: jax.Array  # (T, N, A) of the policy that acted
     log_prob: jax.Array  # (T, N)
@@ -539,7 +539,7 @@ def init_state(args, env, net, opt, member, member_opt):
     buffer = Transitions(*(jnp.zeros((rows, *shape)) for shape in (*shapes, (env.action_dim,))))
     norm = {name: jnp.ones_like(x) if name.endswith("std") else x for name, x in statistics(buffer).items()}
     ensemble = init_ensemble(args, member, member_opt, norm, buffer, k_members)
-    lr, first, zero = jnp.float32(args.lr), jnp.ones(args.num_envs, bool), jnp.zeros((), jnp.int32)
+    lr, first, zero = jnp.float32(min(args.lr, args.max_lr)), jnp.ones(args.num_envs, bool), jnp.zeros((), jnp.int32)
     return TrainState(params, opt.init(params), lr, env_state, first, ensemble, buffer, zero)
 
 

@@ -37,14 +37,16 @@ class Args:
     robot: str | None = None  # for --task loco: an MJCF, URDF or .toml file, or a run's args.json
     network: Literal["mlp", "pidm"] | None = None  # of actor and critic; None: pidm with --pretrained, else mlp
     pretrained: str | None = None  # PIDM checkpoint written by pretrain_pidm.py
-    policy: str | None = None  # start from this policy.msgpack, of the same network and observation
-    load_into: Literal["both", "actor", "critic", "history_encoder", "shuffled", "none"] = "both"  # see `warm_start`
+    policy: str | None = None  # start from the networks of this policy.msgpack (not its std); same network and obs
+    # where the weights of --pretrained go; shuffled: into both, permuted; none: its input normalisation alone
+    load_into: Literal["both", "actor", "critic", "history_encoder", "shuffled", "none"] = "both"
     # Deviation (weight init): rsl_rl has PyTorch's; with orthogonal weights both quadrupeds learn faster.
     weight_init: Literal["orthogonal", "pytorch", "pytorch_unscaled"] = "orthogonal"  # of layers that are not loaded
-    preset: Literal["smoke", "cpu", "gpu"] = "cpu"  # scale: 4, 256 or 4096 environments
+    preset: Literal["smoke", "cpu", "gpu"] = "cpu"  # scale: 4, 256 (parkour 512) or 4096 environments
     seed: int = 0  # the only source of randomness
     num_seeds: int = 1  # train seed, seed + 1, ... in one program, each in its own run folder
     engine: str = "auto"  # physics: c (CPU threads), mjx (accelerators), warp (NVIDIA)
+    distributed: bool = False  # this is one of several processes, see docs/speed.md; process 0 writes the files
     robust: bool = False  # train for use on a robot: delays, pushes, masses, friction, commands as people give them
     set: tuple[str, ...] = ()  # NAME=VALUE of the task's config, e.g. friction=0.3,1.2 weights.slip=-0.2
     # --- Records ---
@@ -65,7 +67,7 @@ class Args:
     # --- PPO, as in rsl_rl, a fork of which the paper used ---
     num_epochs: int = 5  # passes over each rollout
     num_minibatches: int = 4  # minibatches of a pass, each of B = N * T / num_minibatches samples
-    lr: float = 1e-3  # initial Adam step size, adapted to the KL
+    lr: float | None = None  # initial Adam step size, adapted to the KL; None: 1e-3, with --policy 1e-4
     desired_kl: float | None = None  # the step size keeps the KL from the rollout's policy within a factor 2 of this
     max_lr: float = 1e-2  # largest step size; at large batches a deep critic may want less
     gamma: float = 0.99  # discount per control step
@@ -75,7 +77,6 @@ class Args:
     entropy_coef: float | None = None  # weight of the entropy bonus
     mirror_coef: float = 0.1  # weight of the mirror loss; ours, the paper gives no number
     max_grad_norm: float = 1.0  # norm to which the gradients of actor and critic are clipped, each on its own
-    distributed: bool = False  # this is one of several processes, see docs/speed.md; process 0 writes the files
     shuffle_blocks: int | None = None  # shuffle samples within this many groups of environments; None: 1 per device
 
 
@@ -89,19 +90,17 @@ SHOWN = ("episode_return", "fall_rate", "lin_vel_error", "foot_error", "progress
 
 def merge(args, ppo):
     """Fill the fields left at None from the preset and the task's settings `ppo`, and check the result."""
-    if args.pretrained and args.network == "mlp":
-        raise records.UserError("--pretrained loads a PIDM; leave out --network mlp")
-    if args.policy and args.pretrained:
-        raise records.UserError("--policy and --pretrained exclude each other; leave one out")
+    if args.pretrained and (args.policy or args.network == "mlp"):
+        raise records.UserError("--pretrained loads a PIDM into new networks; leave out --policy and --network mlp")
     if args.load_into != "both" and not args.pretrained:
         raise records.UserError(f"--load-into {args.load_into} needs --pretrained CHECKPOINT")
     network = args.network or ("pidm" if args.pretrained else "mlp")
     loaded = {"both": "pretrained", "none": "random"}.get(args.load_into, args.load_into)
-    method = "mlp" if network == "mlp" else f"pidm_{loaded if args.pretrained else 'random'}"
+    method = network if args.policy or network == "mlp" else f"pidm_{loaded if args.pretrained else 'random'}"
     seed = f"/seed{args.seed}" * (args.num_seeds == 1)
     values = {"network": network, "run_dir": f"runs/{envs.label(args.task, args.robot)}/{method}{seed}"}
-    values |= {"hidden": ppo["hidden"], "intention": ppo.get("intention"), "init_std": ppo["init_std"]}
-    values |= {"entropy_coef": ppo["entropy"], "desired_kl": ppo.get("desired_kl", 0.01)}
+    values |= {"hidden": ppo["hidden"], "intention": ppo.get("intention"), "lr": 1e-4 if args.policy else 1e-3}
+    values |= {"init_std": ppo["init_std"], "entropy_coef": ppo["entropy"], "desired_kl": ppo.get("desired_kl", 0.01)}
     values |= {"shuffle_blocks": jax.device_count()} | PRESETS[args.preset] | ppo.get(args.preset, {})
     return records.check_minibatches(records.filled(args, values))
 
@@ -122,7 +121,7 @@ def dense(width, fan_in, gain, weight_init):
 
 
 class MLP(nn.Module):
-    """Dense layers with ELU between them; the last one is linear, its weights scaled by `gain`."""
+    """Dense layers with ELU between them; the last one is linear. Its weights are scaled by `gain` if orthogonal."""
 
     widths: tuple[int, ...]
     gain: float = 2**0.5
@@ -284,9 +283,11 @@ def shuffle_weights(tree, key):
 def warm_start(args, env, params, key):
     """Set a PIDM's input normalisation and, with --pretrained, load history_encoder and backbone (paper Sec. IV-E).
 
-    --load-into names the branches, or the one part, to load. Without --pretrained the shipped normalisation is used, so
-    that runs differ in weights alone. UserError if the file is missing or of another robot, action scale, dt, x or K.
+    --load-into names what to load. Without --pretrained the shipped PIDM's normalisation is used: the two differ in
+    weights alone. UserError if the file is missing or of another robot, action scale, dt, x or K.
     """
+    if args.resume:  # the saved state has both
+        return params
     path = Path(args.pretrained or SHIPPED / f"{env.robot.name}.msgpack")
     core = {name: params["params"]["actor"][name] for name in ("history_encoder", "backbone")}
     pidm = records.load_pidm(path, env, {"params": core, "normalizer": params["normalizer"]})
@@ -297,7 +298,7 @@ def warm_start(args, env, params, key):
         core = {"history_encoder": core["history_encoder"]}
     branches = {"actor": ["actor"], "critic": ["critic"], "none": []}.get(args.load_into, ["actor", "critic"])
     loaded = {branch: params["params"][branch] | core for branch in branches if args.pretrained}
-    for branch in loaded if not args.resume else ():
+    for branch in loaded:
         print(f"{branch}: loaded {' and '.join(core)} from {path}")
     return {"params": params["params"] | loaded, "normalizer": jax.tree.map(jnp.asarray, pidm["normalizer"])}
 
@@ -307,18 +308,18 @@ def warm_start(args, env, params, key):
 
 @flax.struct.dataclass
 class TrainState:
-    params: dict
+    params: dict  # as Flax has it: "params", the weights, and "normalizer" of a PIDM, which gets no gradient
     opt_state: optax.OptState
     lr: jax.Array  # ()
     env: envs.base.State  # (N, ...)
-    key: jax.Array  # of the seed, never split: each iteration folds in its number
+    key: jax.Array  # of the seed: each iteration folds in its number
     iteration: jax.Array  # () PPO iterations done
 
 
 # >>> copy: rollout (owner: ppo_finetune.py)
 @flax.struct.dataclass
 class Rollout:
-    inputs: dict  # of the network: obs (T, N, O), prop (T, N, K+1, X), action (T, N, K, A)
+    inputs: dict  # of the network: obs (T, N, O), prop (T, N, K+1, X), past action (T, N, K, A)
     action: jax.Array  # (T, N, A)
     mean: jax.Array  # (T, N, A) of the policy that acted
     log_prob: jax.Array  # (T, N)
@@ -338,7 +339,7 @@ def log_prob(mean, log_std, action):
 
 
 def rollout(args, env, net, params, env_state, key):
-    """Act for T steps in N environments. Returns the last environment state, a Rollout and metrics (T,)."""
+    """Act for T steps in N environments. Returns the last environment state, and a Rollout with metrics (T,)."""
 
     def step(env_state, key):
         inputs = net.inputs(env_state.obs, env_state.history)
@@ -349,12 +350,10 @@ def rollout(args, env, net, params, env_state, key):
         # Deviation (time limits): rsl_rl bootstraps with V of the observation before the last step, not after it.
         final_value = net.apply(params, net.inputs(env_state.final_obs, env_state.final_history), method=net.value)
         bootstrap = args.gamma * final_value * (env_state.truncated if env.bootstrap_time_outs else 0.0)
-        logp = log_prob(mean, log_std, action)
-        roll = Rollout(inputs, action, mean, logp, value, env_state.reward, bootstrap, done)
+        roll = Rollout(inputs, action, mean, log_prob(mean, log_std, action), value, env_state.reward, bootstrap, done)
         return env_state, (roll, metrics.step_metrics(env_state))
 
-    env_state, (roll, report) = jax.lax.scan(step, env_state, jax.random.split(key, args.num_steps))
-    return env_state, roll, report
+    return jax.lax.scan(step, env_state, jax.random.split(key, args.num_steps))
 
 
 # --- Losses ---
@@ -402,7 +401,7 @@ def ppo_loss(args, env, net, params, log_std_old, batch, key):
     """Total loss of one minibatch (leading axis B), and its parts for the log."""
     roll, advantage, ret = batch
     mean, log_std, value = net.apply(params, roll.inputs)
-    # clipped surrogate
+    # clipped surrogate, Schulman et al. 2017 eq. 7
     ratio = jnp.exp(log_prob(mean, log_std, roll.action) - roll.log_prob)
     clipped = jnp.clip(ratio, 1 - args.clip, 1 + args.clip)
     policy_loss = -jnp.minimum(ratio * advantage, clipped * advantage).mean()
@@ -466,9 +465,9 @@ def update(args, env, net, opt, state, batch, key):
     advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
     log_std_old = state.params["params"]["log_std"]
 
-    def minibatch(carry, inputs):
+    def minibatch(carry, xs):
         params, opt_state, lr = carry
-        batch, key = inputs
+        batch, key = xs
         gradient = jax.grad(partial(ppo_loss, args, env, net, log_std_old=log_std_old, key=key), has_aux=True)
         grads, losses = devices.mean_in_pieces(lambda piece: gradient(params, batch=piece), batch)
         lr = adapt_lr(args, lr, losses["kl"])
@@ -491,10 +490,11 @@ def update(args, env, net, opt, state, batch, key):
 
 
 def iteration(args, env, net, opt, state):
-    """One PPO iteration: rollout, advantages, update. Its randomness depends on (seed, iteration) alone."""
+    """One PPO iteration: rollout, advantages, update. Noise and shuffles come from (seed, iteration) alone."""
     k_roll, k_update = jax.random.split(jax.random.fold_in(state.key, state.iteration))
-    env_state, roll, report = rollout(args, env, net, state.params, state.env, k_roll)
+    env_state, (roll, report) = rollout(args, env, net, state.params, state.env, k_roll)
     last_value = net.apply(state.params, net.inputs(env_state.obs, env_state.history), method=net.value)
+    # a time limit is no end of the task: what would have followed it counts with its reward
     advantage, ret = gae(args, roll.reward + roll.bootstrap, roll.done, roll.value, last_value)
     new, losses = update(args, env, net, opt, state, (roll, advantage, ret), k_update)
     report = metrics.over_time(report) | losses
@@ -514,8 +514,8 @@ def init_state(args, env, net, opt):
     if args.weight_init == "pytorch":  # orthogonal last layers are small already, pytorch_unscaled keeps PyTorch's
         shrink_first_actions(params)
     params = warm_start(args, env, params, key) if args.network == "pidm" and not args.policy else params
-    params = records.load_policy(args.policy, params, env) if args.policy else params
-    return TrainState(params, opt.init(params), jnp.float32(args.lr), env_state, key, jnp.zeros((), jnp.int32))
+    params = records.load_policy(args.policy, params, env) if args.policy and not args.resume else params
+    return TrainState(params, opt.init(params), jnp.float32(min(args.lr, args.max_lr)), env_state, key, jnp.int32(0))
 
 
 def make_chunk(args, env, net, opt, states):

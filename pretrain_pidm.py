@@ -91,7 +91,7 @@ def dense(width, fan_in, gain, weight_init):
 
 
 class MLP(nn.Module):
-    """Dense layers with ELU between them; the last one is linear, its weights scaled by `gain`."""
+    """Dense layers with ELU between them; the last one is linear. Its weights are scaled by `gain` if orthogonal."""
 
     widths: tuple[int, ...]
     gain: float = 2**0.5

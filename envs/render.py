@@ -111,7 +111,9 @@ def draw(spec, qpos, size=(WIDTH, HEIGHT)):
     model = spec.compile()
     from envs import gl  # not at the top, for the second process has no package `envs`
 
-    names = [name for name in (gl.ASKED, "glfw" if os.environ.get("DISPLAY") else "", "egl", "osmesa") if name]
+    linux = ("glfw" if os.environ.get("DISPLAY") else "", "egl", "osmesa")
+    here = {"darwin": ("cgl",), "win32": ("wgl",)}.get(sys.platform, linux)  # what MuJoCo knows on each system
+    names = [name for name in (gl.ASKED, *here) if name]
     with tempfile.TemporaryDirectory() as folder:
         Path(folder, "model.xml").write_text(spec.to_xml())
         np.save(Path(folder, "qpos.npy"), qpos)
@@ -124,7 +126,7 @@ def draw(spec, qpos, size=(WIDTH, HEIGHT)):
                 gl.ASKED = name  # the next picture needs no search
                 return [Image.fromarray(frame) for frame in np.load(Path(folder, "frames.npy"))]
     tried = ", ".join(names)
-    print(f"no OpenGL here (tried {tried}): drawing stick figures; Debian's libosmesa6 gives real pictures")
+    print(f"no OpenGL here (tried {tried}): drawing stick figures; on Linux libosmesa6 gives real pictures")
     data = mujoco.MjData(model)
     return [stick_figure(model, data, q) for q in qpos]
 

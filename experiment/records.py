@@ -277,12 +277,14 @@ def load_policy(path, like, env):
     """Params of a policy file, but with the action std of `like`. UserError if it lacks the leaves and shapes of that.
 
     A trained policy has a small std, with which it would hardly explore. UserError also if it is of another robot,
-    body or network.
+    body, observation or network.
     """
     params, meta = load(Path(path), "policy")
-    task = envs.TASKS.get(meta["task"])  # None of a robot from a file, whose body tells it apart
-    if task and task[1].robot != env.robot.name:
-        raise UserError(f"{path} is a policy for robot {task[1].robot}, here is robot {env.robot.name}")
+    family, config = envs.TASKS.get(meta["task"], (None, None))  # of a robot from a file, whose body tells it apart
+    if config and config.robot != env.robot.name:
+        raise UserError(f"{path} is a policy for robot {config.robot}, here is robot {env.robot.name}")
+    if family and [*family.OBS] != [*type(env).OBS]:  # of as many numbers, say
+        raise UserError(f"{path} sees {', '.join(family.OBS)}; this task has {', '.join(type(env).OBS)}")
     here = "pidm" if "normalizer" in like else "mlp"
     network = meta["args"].get("network", here)
     if network != here:

@@ -131,7 +131,7 @@ def draw_controls(study, path):
 
 
 def draw_updates(study, path, task="anymal_pedipulation"):
-    """Paper Fig. 6: mean change of a weight of the actor in the first iterations; below, per unit of step size."""
+    """Paper Fig. 7: mean change of a weight of the actor in the first iterations; below, per unit of step size."""
     runs = study.get(task, {})
     if not {"pidm_random", "pidm_pretrained"} <= runs.keys():
         return False

@@ -19,7 +19,7 @@ import numpy as np
 from scipy import stats
 
 DRAWS = 9_999  # bootstrap resamples
-EARLY = 100  # iterations of the paper's Fig. 6
+EARLY = 100  # iterations of the paper's Fig. 7
 
 
 @dataclass(frozen=True)
@@ -134,9 +134,12 @@ def change(name, arm, baseline, i, j):
     return 100 * (means[0] / means[1] - 1)
 
 
-def early(runs, name):
-    """Mean of a column over the first iterations, mean over runs."""
-    return np.mean([run["columns"][name][run["iteration"] <= EARLY].mean() for run in runs])
+def early_ratio(name, arm, baseline):
+    """Mean of a column over the first iterations and over runs, as a multiple of the baseline's."""
+    means = [
+        np.mean([run["columns"][name][run["iteration"] <= EARLY].mean() for run in runs]) for runs in (arm, baseline)
+    ]
+    return means[0] / means[1]
 
 
 def seeds(runs, methods):

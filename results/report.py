@@ -263,8 +263,17 @@ def controls(loaded):
                 row["seeds"] = ", ".join(str(run["seed"]) for run in arms[method])
                 for name, title in CONTROLLED.items():
                     row[f"{title} [%]"] = shown(measures.compare(task, arms, method, name, against), "")
-                rows.append(row | {"better at the end, of seeds": wins(arms, method, "final", against)})
+                row["better at the end, of seeds"] = wins(arms, method, "final", against)
+                rows.append(row | {"early updates of the backbone [%]": early_updates(arms, method, against)})
     return markdown(rows)
+
+
+def early_updates(runs, method, against):
+    """Change [%] of the updates of the actor's backbone in the first iterations as text; empty for an MLP."""
+    name = "update/actor/backbone"
+    if any(name not in run["columns"] for m in (method, against) for run in runs[m]):
+        return ""
+    return f"{100 * (measures.early_ratio(name, runs[method], runs[against]) - 1):+.0f}"
 
 
 def batches_table(loaded):
@@ -291,7 +300,7 @@ def updates_table(study):
         if not {"pidm_pretrained", "pidm_random"} <= runs.keys():
             continue
         ratio = {
-            name: measures.early(runs["pidm_pretrained"], name) / measures.early(runs["pidm_random"], name)
+            name: measures.early_ratio(name, runs["pidm_pretrained"], runs["pidm_random"])
             for name in ("lr", *(f"update/actor/{module}" for module in drawing.MODULES))
         }
         step = ratio.pop("lr")

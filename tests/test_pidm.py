@@ -15,6 +15,7 @@ import pytest
 import envs
 import ppo_finetune as finetune
 import pretrain_pidm as script
+from envs import pedipulation
 from experiment import figures, records
 from results import pidm
 
@@ -387,10 +388,25 @@ def test_a_robot_without_a_shipped_checkpoint(pretrained, jitted, tmp_path, monk
     for part in ("actor", "critic"):
         jax.tree.map(np.testing.assert_array_equal, state.params["params"][part], saved["params"][part])
     np.testing.assert_allclose(state.params["params"]["log_std"], calm["log_std"] + 1, err_msg="it explores anew")
+    assert np.isclose(state.lr, 1e-4), "1e-3 would undo in its first update what was learned"
+    assert finetune.merge(args, env.config.ppo).run_dir == "runs/go1_loco/pidm/seed0", "not called random"
+    monkeypatch.setitem(envs.TASKS, "stand", (pedipulation.Pedipulation, envs.TASKS["go1_loco"][1]))
+    records.save(policy, saved, {"task": "stand", "args": {}})
+    with pytest.raises(records.UserError, match=r"sees lin_vel, .*, target; this task has lin_vel, .*, command, "):
+        records.load_policy(policy, saved, env)  # as many numbers in another order
     with pytest.raises(records.UserError, match="--load-into none"):
         start(env)
     other = finetune.Args(pretrained=str(pretrained / "pidm.msgpack"), load_into="none")
     assert finetune.merge(other, env.config.ppo).run_dir == "runs/go1_loco/pidm_random/seed0"
+
+
+@pytest.mark.parametrize("gone", ["policy", "pretrained"])
+def test_a_resumed_run_does_not_need_the_weights_it_began_with(gone, jitted):
+    env = jitted("go1_loco").env
+    args = finetune.Args(preset="smoke", network="pidm", resume="a run", **{gone: "gone.msgpack"})
+    args, opt = finetune.merge(args, env.config.ppo), finetune.optax.scale_by_adam()
+    net = finetune.make_net(args, env)
+    assert jax.eval_shape(lambda: finetune.init_state(args, env, net, opt)).lr.shape == ()
 
 
 def test_shuffled_weights_keep_their_values_and_lose_their_place(pretrained, jitted):

@@ -206,6 +206,12 @@ def test_step_size_has_a_largest_value():
     assert script.adapt_lr(args, jnp.float32(2.5e-3), 1e-4) == pytest.approx(3e-3, rel=1e-5)
 
 
+def test_no_run_starts_above_its_largest_step_size(jitted):
+    env = jitted("go1_loco").env
+    args = script.merge(script.Args(preset="smoke", max_lr=5e-4), env.config.ppo)
+    assert script.init_state(args, env, script.make_net(args, env), optax.scale_by_adam()).lr == np.float32(5e-4)
+
+
 def test_gradients_are_clipped_apart():
     grads = {
         "params": {"actor": {"w": jnp.array([3.0, 4.0])}, "log_std": jnp.zeros(1), "critic": {"w": jnp.array([0.3])}}

@@ -18,7 +18,7 @@ from tools import bench
 
 def curve(values, seed=0):
     rows = {"iteration": np.arange(1.0, len(values) + 1), "indicator": np.asarray(values, float)}
-    return rows | {"seed": seed, "settings": {"num_envs": 256, "num_steps": 24}}
+    return rows | {"seed": seed, "settings": {"num_envs": 256, "num_steps": 24}, "columns": {}}
 
 
 def flat(*levels):
@@ -234,6 +234,11 @@ def test_controls_compare_the_same_seeds():
     line = report.controls({"cpu": {"go1_loco": runs}})[-1].split(" | ")
     assert line[1:6] == ["256 x 24", "PIDM shuffled", "PIDM random", "0, 1", "+10.0"]
     assert measures.same_seeds(runs, "pidm_shuffled", "mlp") == {}
+    for method, moves in {"pidm_shuffled": 3.0, "pidm_random": 2.0}.items():
+        for run in runs[method]:
+            run["columns"] = {"update/actor/backbone": np.full(10, moves)}
+    runs["pidm_random"][2]["columns"]["update/actor/backbone"] += 99.0  # the seed without a partner
+    assert report.controls({"cpu": {"go1_loco": runs}})[-1].endswith("| +50 |")
 
 
 # --- Tables ---

@@ -104,6 +104,7 @@ def test_first_actions_are_small(fresh):
     [
         ({"network": "mlp", "pretrained": None}, "MLP"),
         ({"network": "pidm", "pretrained": None}, "random PIDM"),
+        ({"network": "pidm", "pretrained": None, "policy": "x"}, "PIDM"),
         ({"network": "pidm", "pretrained": "x", "load_into": "both"}, "pretrained PIDM"),
         ({"network": "pidm", "pretrained": "x"}, "pretrained PIDM"),
         ({"network": "pidm", "pretrained": "x", "load_into": "none"}, "random PIDM"),

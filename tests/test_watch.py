@@ -15,6 +15,7 @@ from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
+import mujoco.viewer
 import numpy as np
 import pytest
 from PIL import Image
@@ -235,6 +236,18 @@ def test_what_cannot_be_watched_is_refused(refused, monkeypatch):
     refused(play.main, change(viewer=True), "needs a display", "--web")
     refused(play.main, change(viewer=True, web=True), "--viewer and --web")
     refused(play.main, change(web=True, level=3), "no level")
+
+
+def test_a_window_that_does_not_open_is_one_line(walker, monkeypatch):
+    """As on macOS with plain python."""
+
+    def launch(*_, **__):
+        raise RuntimeError("it must be run under `mjpython` on macOS")
+
+    monkeypatch.setenv("DISPLAY", ":0")
+    monkeypatch.setattr(mujoco.viewer, "launch_passive", launch)
+    with pytest.raises(records.UserError, match="`mjpython` on macOS; or use --web"):
+        viewer.window(walker)
 
 
 def test_films(tmp_path, monkeypatch, capsys):

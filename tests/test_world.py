@@ -179,6 +179,24 @@ def test_a_wrong_opengl_is_replaced_for_pictures(monkeypatch, capsys):
     assert capsys.readouterr().out == "MUJOCO_GL=wgl does not work here: drew with egl\n"
 
 
+@pytest.mark.parametrize(("system", "names"), [("darwin", ["cgl"]), ("linux", ["egl", "osmesa"])])
+def test_pictures_try_the_opengl_of_the_system(system, names, monkeypatch, capsys):
+    """On macOS MuJoCo refuses the names of Linux's."""
+    tried = []
+
+    def start(command, env, **_):
+        tried.append(env["MUJOCO_GL"])
+        return subprocess.CompletedProcess(command, 1, "", "")
+
+    monkeypatch.setattr(gl, "ASKED", "")
+    monkeypatch.setattr(sys, "platform", system)
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.setattr(subprocess, "run", start)
+    env = envs.make("go1_loco", "c")
+    render.draw(env.scene(visual=True), np.zeros((1, env.engine.model.nq)))
+    assert tried == names and f"tried {', '.join(names)}" in capsys.readouterr().out
+
+
 def test_mujoco_never_sees_mujoco_gl():
     assert "MUJOCO_GL" not in os.environ
 

@@ -234,8 +234,9 @@ ROWS = {
 
 def cpu_name():
     """Name of the processor, if the system gives it."""
-    info = Path("/proc/cpuinfo")
-    names = [line.split(":")[1].strip() for line in info.read_text().splitlines() if "model name" in line]
+    info = Path("/proc/cpuinfo")  # Linux's
+    lines = info.read_text().splitlines() if info.exists() else []
+    names = [line.split(":")[1].strip() for line in lines if "model name" in line]
     return names[0] if names else platform.processor() or platform.machine()
 
 

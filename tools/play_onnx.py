@@ -153,7 +153,11 @@ def watch(player, command):
     def press(key):
         wanted[:] = pressed(key, wanted, -LIMIT, LIMIT)
 
-    with mujoco.viewer.launch_passive(player.model, player.data, key_callback=press) as window:
+    try:
+        opened = mujoco.viewer.launch_passive(player.model, player.data, key_callback=press)
+    except RuntimeError as error:  # on macOS: it wants mjpython in place of python
+        fail(f"--viewer: {error}")
+    with opened as window:
         while window.is_running():
             start = time.perf_counter()
             player.step(wanted)

@@ -159,7 +159,11 @@ def window(robot):
 
     print(HELP)
     options = {"key_callback": robot.press, "show_left_ui": False, "show_right_ui": False}
-    with until_interrupted() as wanted, mujoco.viewer.launch_passive(robot.model, robot.data, **options) as viewer:
+    try:
+        opened = mujoco.viewer.launch_passive(robot.model, robot.data, **options)
+    except RuntimeError as error:  # on macOS: it wants mjpython in place of python
+        raise records.UserError(f"--viewer: {error}; or use --web") from None
+    with until_interrupted() as wanted, opened as viewer:
         follow(viewer.cam)
         run(robot, lambda: wanted() and viewer.is_running(), viewer.sync)
 
