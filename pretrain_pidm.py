@@ -345,14 +345,14 @@ def pretrain(args):
     run = Run(args, env.config, args.epochs, SHOWN, over="samples")
     (state,), (folder,) = run.start(init), run.folders
     state = devices.place(state, jax.tree.map(lambda _: devices.same(), state))
-    step = make_step(args, env, net, opt)
+    step, predictor = make_step(args, env, net, opt), make_predictor(args, env, net)
     past = [row["error"] for row in run.rows[0]]
     with run:
         while not run.done and run.iteration < decay(args, past)[1]:
             epoch = run.iteration + 1
             state, loss = run_epoch(args, data, index, step, state, past)
             row = {"iteration": epoch, "samples": count * epoch, "seconds": run.seconds(), "train_error": loss}
-            row = metrics.rounded(row | errors(env, data, predict_all(args, env, net, state[0], data, few)))
+            row = metrics.rounded(row | errors(env, data, predict_all(predictor, env, state[0], data, few)))
             run.add([row])
             past.append(row["error"])
             if not np.isfinite(loss):
@@ -366,7 +366,7 @@ def pretrain(args):
         figures.plot_curves(run.rows[0], panels, folder / "curve.png", over="samples")
         print(f"wrote {folder}/pidm.msgpack, metrics.csv, curve.png")
         best, _ = records.load(folder / "pidm.msgpack", "PIDM checkpoint")
-        validate(args, env, net, best, data, folder)
+        validate(predictor, env, best, data, folder)
 
 
 def open_data(args):
@@ -397,20 +397,21 @@ def commanded_change(env, x, action):
     return np.float32(env.robot.action_scale) * action - x[..., env.prop_slices()["joint_pos"]]
 
 
-def predict_all(args, env, net, variables, data, index):
-    """Predictions on validation transitions with the tasks' sensor noise, beside what they are compared with.
+def make_predictor(args, env, net):
+    """Return `predict` with the tasks' sensor noise, compiled: variables, batch, key -> action (B, A)."""
+    width = args.noise * noise_width(env)
+    return jax.jit(lambda variables, batch, key: predict(net, variables, add_noise(key, width, batch)))
+
+
+def predict_all(predictor, env, variables, data, index):
+    """Predictions on validation transitions, beside what they are compared with.
 
     Arrays (B, A) by name: predicted, action and last action [action units]; change [rad], see `commanded_change`.
     """
-    width, parts = args.noise * noise_width(env), []
-
-    @jax.jit
-    def predict_noisy(variables, batch, key):
-        return predict(net, variables, add_noise(key, width, batch))
-
+    parts = []
     for number, batch in enumerate(batches(data, index, 8192)):
         key = jax.random.fold_in(jax.random.key(1), number)
-        predicted, action = np.asarray(predict_noisy(variables, batch, key)), batch["action"]
+        predicted, action = np.asarray(predictor(variables, batch, key)), batch["action"]
         change = commanded_change(env, batch["prop"][:, -1], action)
         parts.append({"predicted": predicted, "action": action, "last": batch["past"][:, -1], "change": change})
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
@@ -432,9 +433,9 @@ def errors(env, data, outcome):
     }
 
 
-def validate(args, env, net, variables, data, folder):
+def validate(predictor, env, variables, data, folder):
     """Write validation.json, accuracy.png and distribution.png of these weights on a collection's validation split."""
-    outcome = predict_all(args, env, net, variables, data, data.validation)
+    outcome = predict_all(predictor, env, variables, data, data.validation)
     result = {name: float(x) for name, x in errors(env, data, outcome).items()}
     records.replace_text(folder / "validation.json", json.dumps(result, indent=1) + "\n")
     wrong = np.float32(env.robot.action_scale) * (outcome["predicted"] - outcome["action"])
@@ -455,7 +456,7 @@ def run_validation(args):
     data, env = open_data(args)
     net = PIDM(SIZES[env.robot.like], env.action_dim)
     like = jax.eval_shape(partial(init_variables, args, env, net), data.windows(data.validation[:1]))
-    validate(args, env, net, records.load_pidm(path, env, like), data, path.parent)
+    validate(make_predictor(args, env, net), env, records.load_pidm(path, env, like), data, path.parent)
 
 
 def main(args):

@@ -62,9 +62,8 @@ def check_engine(engine):
     """Raise ValueError if this engine cannot use the present devices."""
     name = type(engine).__name__.removesuffix("Engine").lower()
     if jax.device_count() > 1 and not engine.many_devices:
-        raise ValueError(
-            f"engine {name} works on one device, here are {jax.device_count()}; choose --engine mjx, or set CUDA_VISIBLE_DEVICES=0"
-        )
+        way = "choose --engine mjx, or set CUDA_VISIBLE_DEVICES=0"
+        raise ValueError(f"engine {name} works on one device, here are {jax.device_count()}; {way}")
     if name == "warp" and jax.default_backend() != "gpu":
         raise ValueError("engine warp needs an NVIDIA GPU, here is none that JAX sees; choose --engine c")
 

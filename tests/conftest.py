@@ -21,9 +21,11 @@ import pytest
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 import envs
+import pretrain_pidm
 from experiment.run import Run
 
-LONG = ("test_scripts", "test_sim_to_sim", "test_watch", "test_world")  # late in the alphabet
+LATE = ("readme", "replay", "report", "resume", "rewards", "scripts", "sim_to_sim", "watch", "world")  # in the alphabet
+LONG = tuple(f"test_{name}" for name in LATE)
 
 
 def pytest_collection_modifyitems(items):
@@ -69,8 +71,28 @@ def compiled_once():
             programs[key] = lowered.compile()
         return programs[key]
 
+    def compiled_at_its_calls(make):
+        """The same for functions of stage 2, which are compiled for each shape when they are called."""
+
+        def made(args, env, *rest):
+            function, found = make(args, env, *rest), {}
+
+            def call(*inputs):
+                shapes = tuple(jnp.shape(x) for x in jax.tree.leaves(inputs))
+                if shapes not in found:
+                    lowered = function.lower(*inputs)
+                    key = make.__name__, repr(env.config), args.noise, lowered.as_text()
+                    found[shapes] = programs[key] = programs.get(key) or lowered.compile()
+                return found[shapes](*inputs)
+
+            return call
+
+        return made
+
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Run, "compile", compile)
+        for make in (pretrain_pidm.make_step, pretrain_pidm.make_predictor):
+            patch.setattr(pretrain_pidm, make.__name__, compiled_at_its_calls(make))
         yield
 
 

@@ -201,9 +201,8 @@ def test_validation_sees_noise_and_compares_with_the_present(folder):
     net, index = script.PIDM(script.SIZES["go1"], A), data.validation[:20]
     windows = data.windows(index)
     variables = script.init_variables(script.Args(noise=0.0), env, net, windows)
-    noisy, quiet = (
-        script.predict_all(script.Args(noise=noise), env, net, variables, data, index) for noise in (1.0, 0.0)
-    )
+    predictors = [script.make_predictor(script.Args(noise=noise), env, net) for noise in (1.0, 0.0)]
+    noisy, quiet = (script.predict_all(predictor, env, variables, data, index) for predictor in predictors)
     np.testing.assert_allclose(quiet["predicted"], script.predict(net, variables, windows), atol=1e-5)
     assert np.abs(noisy["predicted"] - quiet["predicted"]).max() > 1e-3
     for outcome in (noisy, quiet):
