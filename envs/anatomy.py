@@ -60,6 +60,11 @@ def bottom(model, data, geom):
 # --- feet and contacts ---
 
 
+def touch(mass):
+    """Force [N] from which on a foot is on the ground: 1 N or, for robots of less than 5 kg, 2% of their weight."""
+    return min(1.0, 0.02 * 9.81 * float(mass))
+
+
 def feet_at_sites(spec, body):
     """Feet of a file that has sites for them, named `..._foot`, and their height above its lowest shape."""
     model, data = posed(spec, np.zeros(len(body["joints"])))  # with all joints at 0 flat feet are level
@@ -86,13 +91,19 @@ def feet_of(path, spec, body, shapes, wishes):
     lowest = {b: min(point[2] - radius for point, radius, _ in some) for b, some in points.items()}
     if not lowest:
         raise ValueError(f"{path}: no shape can touch the ground; add a primitive <geom> to each foot")
-    ground = min(lowest.values())
+    ground, top = min(lowest.values()), max(point[2] + radius for some in points.values() for point, radius, _ in some)
+    if -ground < 0.25 * (top - ground):
+        base = model.body(1).name
+        raise ValueError(f"{path}: the frame of {base} is {-ground:.2f} m above the ground; move it into the trunk")
     leaves = [b for b in lowest if not any(b != other and b in ancestors(model, other) for other in lowest)]
-    feet = [b for b in leaves if lowest[b] < ground * 0.9 and b > 1]
+    feet = [b for b in leaves if lowest[b] < ground + 0.1 * (top - ground) and b > 1]
     if asked := wishes.get("feet"):
         if unknown := [name for name in asked if name not in {model.body(b).name for b in points}]:
             known = ", ".join(model.body(b).name for b in points)
-            raise ValueError(f"{path}: no body {unknown[0]!r} with a shape can be a foot; choose from {known}")
+            fused = "parts without a joint belong to the body above them"
+            raise ValueError(
+                f"{path}: no body {unknown[0]!r} with a shape can be a foot; choose from {known} ({fused})"
+            )
         feet = sorted({model.body(name).id for name in asked})
     if len(feet) < 2:
         raise ValueError(f'{path}: only {len(feet)} foot was found; write feet = ["BODY", "BODY"] into robot.toml')

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from envs import terrain
-from envs.anatomy import AXIAL, POLAR
+from envs.anatomy import AXIAL, POLAR, touch
 from envs.engine import RANDOMISED, Physics, make_engine
 from envs.loader import Robot
 from envs.robots import ROBOTS
@@ -87,7 +87,7 @@ class Motion:
     foot_pos: jax.Array  # (F, 3) world [m]
     foot_vel: jax.Array  # (F, 3) world [m/s]
     foot_force: jax.Array  # (F, 3) world [N]
-    foot_contact: jax.Array  # (F,) bool, more than 1 N
+    foot_contact: jax.Array  # (F,) bool, more than 1 N or, for a robot of less than 5 kg, 2% of its weight
     sensors: jax.Array  # (S,) all readings, among them the contact forces of other bodies
     mocap_pos: jax.Array  # (M, 3) obstacles
     mocap_quat: jax.Array  # (M, 4)
@@ -169,6 +169,7 @@ class Env:
             for kind in ("pos", "vel", "force")
         }
         self.end_sensors = self.engine.sensor(*(f"{name}_force" for name in config.contact_ends))
+        self.touch = touch(self.model.body_mass.sum())
         self.legs = self.leg_chains()
         self.mirrors = {mirror: self.mirror_tables(mirror) for mirror in self.robot.mirrors}
         self.prop_layout = tuple(PROP)
@@ -428,7 +429,7 @@ class Env:
             foot_pos=physics.sensors[self.foot_sensors["pos"]],
             foot_vel=physics.sensors[self.foot_sensors["vel"]],
             foot_force=force,
-            foot_contact=jnp.linalg.norm(force, axis=-1) > 1.0,
+            foot_contact=jnp.linalg.norm(force, axis=-1) > self.touch,
             sensors=physics.sensors,
             mocap_pos=physics.mocap_pos,
             mocap_quat=physics.mocap_quat,

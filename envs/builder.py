@@ -38,7 +38,7 @@ def simplify(path, spec, notes):
         reader.fix_masses(path, spec)
     for geom in meshes:
         if reader.solid(geom):
-            geom.type = GEOM.mjGEOM_BOX  # MuJoCo fits it
+            geom.type = GEOM.mjGEOM_BOX if geom.type == GEOM.mjGEOM_MESH else geom.type  # MuJoCo fits it
             fitted[geom.parent.name] = None
         elif not reader.weighs(spec, geom):
             spec.delete(geom)

@@ -71,6 +71,8 @@ def load(path):
     spec, notes = reader.read(path), []
     refuse_what_cannot_be_walked(path, spec)
     base = reader.base_of(path, spec, notes)
+    if spec.tendons or any(one.gravcomp for one in spec.bodies):
+        notes.append("tendons and gravity compensation are left out")
     lost = builder.simplify(path, spec, notes)
     model = reader.compiled(path, spec)
     root = model.body(base).id
@@ -121,7 +123,10 @@ def rounded(body):
 
 
 def refuse_what_cannot_be_walked(path, spec):
-    """ValueError for closed loops and for tendons that move joints."""
+    """ValueError for closed loops, coupled joints, and tendons that move joints."""
+    if coupled := [one.name1 for one in spec.equalities if one.type == mujoco.mjtEq.mjEQ_JOINT]:
+        what = f"couples {', '.join(coupled)} to other joints (<mimic>, <equality>), which no engine here solves"
+        raise ValueError(f"{path} {what}; remove that, and make these joints fixed or drive them alone")
     if spec.equalities:
         names = ", ".join(one.name1 or one.name for one in spec.equalities)
         raise ValueError(f"{path} has closed loops, which no engine here solves; remove its <equality> ({names})")
@@ -217,7 +222,8 @@ def joints_of(path, model, root):
     if other := [j for j in joints if model.jnt_type[j] != JOINT.mjJNT_HINGE]:
         raise ValueError(f"{path}: only hinges can be driven; {name(other)} is none")
     if loose := [j for j in joints if not model.jnt_limited[j]]:
-        raise ValueError(f"{path}: joint {name(loose)} has no limits; add range=...")
+        how = "in MJCF add range=..., in URDF type=revolute with a <limit>; make the joint of a sensor fixed"
+        raise ValueError(f"{path}: joint {name(loose)} has no limits; {how}")
     if not joints:
         raise ValueError(f"{path} has no joint below {model.body(root).name}")
     return joints
@@ -225,7 +231,7 @@ def joints_of(path, model, root):
 
 def default_pose(path, model, joints, wishes):
     """Angles (A,) of the keyframe `home`, `stand` or the only one, with those of robot.toml's `pose` over them."""
-    keys = [model.key(k).name for k in range(model.nkey)]
+    keys = [model.key(k).name or str(k) for k in range(model.nkey)]
     pose, asked = [None] * len(joints), wishes.get("keyframe")
     if asked and asked not in keys:
         raise ValueError(f"{path} has no keyframe {asked!r}; it has {', '.join(keys) or 'none'}")
@@ -290,10 +296,7 @@ def motors_of(path, model, joints, pose, wishes, notes):
     source = ["robot.toml" if kp is not None else known for kp, known in zip(asked, source, strict=True)]
     if min(*limits, *kp, *kd, *scale) <= 0:
         raise ValueError(f"{path}: gains, torque limits and action scales must be above 0")
-    if model.dof_frictionloss.any():
-        notes.append("dry friction of the joints is left out; --set joint_friction=LOW,HIGH [N m] randomises it")
-    if [driven.get(j) for j in joints] != sorted(driven.values()) and driven:
-        notes.append("actions follow the order of the file's tree, not that of its actuators")
+    notes += left_out(model, joints, driven, gains[:, 1])
     return {
         "kp": kp,
         "kd": kd,
@@ -303,6 +306,18 @@ def motors_of(path, model, joints, pose, wishes, notes):
         "gains_from": source,
         "damping_ratio": kd / (2 * np.sqrt(kp * inertia)),
     }
+
+
+def left_out(model, joints, driven, kd):
+    """Notes on what the file says of joints and motors that does not count. kd (A,): 0 where it has none."""
+    notes = []
+    if model.dof_damping[model.jnt_dofadr[joints]][kd == 0].any():
+        notes.append("damping of joints without a position actuator is replaced by kd")
+    if model.dof_frictionloss.any():
+        notes.append("dry friction of the joints is left out; --set joint_friction=LOW,HIGH [N m] randomises it")
+    if [driven.get(j) for j in joints] != sorted(driven.values()) and driven:
+        notes.append("actions follow the order of the file's tree, not that of its actuators")
+    return notes
 
 
 def torque_limit(model, joint, actuator):

@@ -38,10 +38,10 @@ def shared(body):
 
 def loco(body):
     """Config of velocity tracking for a body."""
-    weights = scaled(GO1_LOCO.weights, body)
+    weights, steps = scaled(GO1_LOCO.weights, body), scaled(STEPS, body)
     robust = {"added_mass": tuple(body["added_mass"]), "joint_friction": (0.0, 0.01 * max(body["torque_limit"]))}
     if len(body["feet"]) > 2:
-        robust |= ROBUST_QUADRUPED | {"weights": weights | STEPS, "gait_hz": 2.8, "stance": 0.5}
+        robust |= ROBUST_QUADRUPED | {"weights": weights | steps, "gait_hz": 2.8, "stance": 0.5}
         return dataclasses.replace(GO1_LOCO, **shared(body), weights=weights, robust=robust)
     terms = {name: G1_LOCO.weights[name] for name in BIPED_TERMS}
     weights |= scaled(terms, body) | {"track_yaw_rate": 1.5, "orientation": -1.0, "air_time": 0.0, "pose": -0.2}

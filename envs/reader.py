@@ -20,17 +20,29 @@ def read(path):
     if not path.is_file():
         raise ValueError(f"{path}: there is no such file")
     try:
-        tag = ET.parse(path).getroot().tag
+        root = ET.parse(path).getroot()
     except (ET.ParseError, LookupError, ValueError) as error:  # the last two: of unknown encodings
         raise ValueError(f"{path} is not an XML file: {one_line(error)}") from None
+    if any("www.ros.org/wiki/xacro" in part.tag or "${" in str(part.attrib) for part in root.iter()):
+        raise ValueError(f"{path} has macros; expand them first: xacro {path.name} > robot.urdf")
     try:
         spec = mujoco.MjSpec.from_file(os.fsencode(path).decode())  # MuJoCo wants UTF-8, whatever the locale
     except (ValueError, mujoco.FatalError) as error:
         raise ValueError(f"MuJoCo cannot read {path}: {one_line(error)}") from None
-    if tag == "robot":
+    if root.tag == "robot":
         for geom in spec.geoms:
             geom.mass = 0.0  # in URDF a link without <inertial> is weightless, whatever its shapes
+        find_meshes(path, spec)
     return spec
+
+
+def find_meshes(path, spec):
+    """Find a URDF's meshes as ROS does: package://bot/meshes/leg.stl is bot/meshes/leg.stl in a folder above it."""
+    for mesh in [mesh for mesh in spec.meshes if not loadable(spec, mesh)]:
+        parts = Path(mesh.file.split("://")[-1]).parts
+        tails = [Path(*parts[i:]) for i in range(min(2, len(parts)))]  # the package's own folder may have another name
+        files = (folder / tail for folder in path.resolve().parents for tail in tails)
+        mesh.file = str(next((file for file in files if file.is_file()), mesh.file))
 
 
 def compiled(path, spec):
@@ -62,9 +74,13 @@ def base_of(path, spec, notes):
         if len(roots) != 1 or roots[0].joints:
             raise ValueError(f"{path} has a fixed base, which cannot walk; add <freejoint/> to the robot's trunk")
         free, (root,) = roots, roots
+        twin = spec.copy()
+        drop(twin, "keys")
+        place = compiled(path, twin).body(root.name)
         root.add_freejoint()
         for key in spec.keys:
-            key.qpos = [0, 0, 0, 1, 0, 0, 0, *key.qpos]
+            key.qpos = [*place.pos, *place.quat, *key.qpos] if len(key.qpos) else []
+            key.qvel = [*[0] * 6, *key.qvel] if len(key.qvel) else []
         notes.append(f"a free joint was added to {root.name}")
     free[0].name = free[0].name or "base"
     for body in spec.bodies:
@@ -148,5 +164,6 @@ def mesh_name(mesh):
 
 
 def loadable(spec, mesh):
-    """True if a mesh stands in the file itself, or its own file is there."""
-    return not mesh.file or Path(spec.modelfiledir, spec.meshdir, mesh.file).is_file()
+    """True if a mesh stands in the file itself, or its own file is there, of a kind that MuJoCo reads."""
+    kind = Path(mesh.file).suffix.lower() in (".stl", ".obj", ".msh")
+    return not mesh.file or (kind and Path(spec.modelfiledir, spec.meshdir, mesh.file).is_file())

@@ -11,10 +11,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from envs.anatomy import touch
+
 SECONDS, WARM_UP = 10.0, 2.0  # [s] of a recording, and of its start that means leave out
 SWITCH_SECONDS = 2.5  # between two commands of "switches"
 REVERSE_SECONDS = 4.0  # of "reverse" before its command changes sign
-CONTACT = 1.0  # [N] a foot with more touches the ground
 STILL = 0.05  # [m/s] a slower foot is still
 CHATTER = 0.04  # [s] a shorter flight or touch is none
 HIGH = 8.0  # [Hz] faster changes of an action are no walking
@@ -179,14 +180,15 @@ def swings(r, rows, touching, body):
 
 
 def is_left(foot):
-    """True for a left foot, by its name: left_foot, LF_foot, RL_foot (rear left)."""
-    return foot.split("_")[0].lower() in ("left", "lf", "lh", "lr", "fl", "rl", "hl")
+    """True for a left foot, by its name: left_foot, leg_front_left, LF_foot, RL_foot (rear left), LM (middle)."""
+    words = foot.lower().split("_")
+    return "left" in words or words[0] in ("l", *(f"l{end}" for end in "fmhrb"), *(f"{end}l" for end in "fmhrb"))
 
 
 def feet(r, rows, body):
     """Stance, swing, slip and peak force of the feet."""
     force, speed = np.linalg.norm(r.foot_force, axis=-1), np.linalg.norm(r.foot_vel, axis=-1)
-    touching = force > CONTACT
+    touching = force > touch(body.mass)
     duty = np.array([mean(touching[rows][:, foot]) for foot in range(len(body.feet))])
     touchdowns, peaks = swings(r, rows, touching, body)
     clearance = [np.median(found) if found else np.nan for found in peaks]

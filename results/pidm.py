@@ -155,7 +155,7 @@ def first_features(task, **choice):
 
     @jax.jit
     def features(state):
-        _, roll, _ = ppo_finetune.rollout(args, env, net, state.params, state.env, state.key)
+        _, (roll, _) = ppo_finetune.rollout(args, env, net, state.params, state.env, state.key)
         _, outputs = net.apply(state.params, roll.inputs, capture_intermediates=True, mutable=["intermediates"])
         return nn.elu(outputs["intermediates"]["actor"]["backbone"]["__call__"][0]), roll.mean
 

@@ -75,9 +75,9 @@ def test_forces_come_and_go(go1):
         state = step(state, jnp.zeros((64, 12)))
         seen.append(np.asarray(state.physics.wrench[:, 1, :3]))
     pushed = np.any(np.stack(seen), -1)
-    assert np.abs(seen).max() <= 25.0 and 0.1 < pushed[-20:].mean() < 0.8
+    assert np.abs(seen).max() <= 25.0 and 0.2 < pushed[-20:].mean() < 0.56  # half of 1 - 0.99^140: 0.38 +- 0.06
     changes = (np.diff(np.stack(seen), axis=0) != 0).any(-1).mean()
-    assert changes < 0.05
+    assert 0.004 < changes < 0.012  # 0.01 a step, of which a quarter is from none to none
 
 
 def test_engines_agree_on_rough_ground():
@@ -85,15 +85,18 @@ def test_engines_agree_on_rough_ground():
 
     Only that: MJX finds other contact points on the field's edges than C does, and moving robots part from there.
     """
-    states = {}
+    places = {}
     for engine in ("c", "mjx"):
-        env = envs.make_explore("go1", engine, rough=1.0, perturb_force=0.0, push_velocity=0.0, max_tilt=180.0)
-        state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(3), 4))
-        step = jax.jit(jax.vmap(env.step))
+        env = envs.make_explore("go1", engine, rough=1.0)
+        if engine == "c":
+            start = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(3), 4)).physics
+            ground = np.asarray(env.ground_height(None, start.qpos[:, :2]))
+        physics, step = start, jax.jit(jax.vmap(env.engine.step))
         for _ in range(10):
-            state = step(state, jnp.zeros((4, 12)))
-        states[engine] = np.asarray(state.physics.qpos[:, :3])
-    np.testing.assert_allclose(states["c"], states["mjx"], atol=0.02)
+            physics = step(physics, jnp.broadcast_to(env.default_pose, (4, 12)))
+        places[engine] = np.asarray(physics.qpos[:, :3])
+    np.testing.assert_allclose(places["c"], places["mjx"], atol=0.02)
+    assert ground.max() > 0.05 and (start.qpos[:, 2] - places["c"][:, 2]).max() < 0.04, "they do not stand on the field"
 
 
 # --- ensemble ---
@@ -215,9 +218,14 @@ def test_collection_on_disk(collected):
 
 
 def test_set_reaches_the_data_and_the_records(tmp_path):
-    """All on the plane, with the numbers in args.json and meta.json; what is not named keeps its value."""
+    """All on the plane, with the numbers in args.json and meta.json; what is not named keeps its value.
+
+    A random policy moves there, which does not learn.
+    """
     out = tmp_path / "flat"
-    script.main(dataclasses.replace(SMOKE, run_dir=str(out), set=("rough=0", "friction=0.5,0.6")))
+    args = dataclasses.replace(SMOKE, policy="random", run_dir=str(out), set=("rough=0", "friction=0.5,0.6"))
+    state = script.main(args)
+    assert float(jnp.exp(state.params["params"]["log_std"]).mean()) == pytest.approx(1.0)
     assert not np.load(out / "rough.npy").any()
     for name in ("args.json", "meta.json"):
         record = json.loads((out / name).read_text())
@@ -235,11 +243,6 @@ def test_first_clocks_are_spread():
     opt = optax.scale_by_adam()
     clocks = np.asarray(script.init_state(args, env, net, opt, member, opt).env.clock)
     assert clocks.min() < 200 and 800 < clocks.max() < env.episode_steps
-
-
-def test_random_policy_does_not_learn(tmp_path):
-    state = script.main(dataclasses.replace(SMOKE, policy="random", run_dir=str(tmp_path / "r")))
-    assert float(jnp.exp(state.params["params"]["log_std"]).mean()) == pytest.approx(1.0)
 
 
 def test_stages_one_to_three_through_files(collected, tmp_path):

@@ -10,8 +10,6 @@ import numpy as np
 import pytest
 
 import envs
-import play
-from envs import render
 from experiment import gait
 from tools import gait as tool
 
@@ -229,15 +227,10 @@ def test_a_recorded_policy_from_end_to_end(tmp_path, capsys):
     assert 0.05 < of["forward 0.8"]["torque_rms"] < 1 and 0.5 < of["forward 0.8"]["foot_force"] < 5
 
 
-def test_an_evaluation_holds_the_summary(tmp_path, monkeypatch, capsys):
-    """Faults: no gait in eval.json, or one of episodes that --set has cut short."""
-    path = tmp_path / "policy.msgpack"
-    path.write_bytes((TASKS / "go1_loco/policy.msgpack").read_bytes())
-    monkeypatch.setattr(render, "film", lambda *words, **kwargs: {})
-    play.main(play.Args(str(path), episodes=2, set=("episode_seconds=0.5",)))
-    found = json.loads((tmp_path / "eval.json").read_text())["gait"]
-    assert found["episodes"] == len(gait.COMMANDS) and found["push of 1.0 m/s/episodes"] == 2
-    assert found["stride_frequency"] > 1 and "limits" in capsys.readouterr().out
+@pytest.mark.parametrize("left", ["left_foot", "leg_front_left_foot", "LF_foot", "RL_calf_foot", "BL_foot", "LM_foot"])
+def test_left_feet_are_known_by_their_names(left):
+    right = left.replace("left", "right").replace("L", "R") if "R" not in left else "RR_calf_foot"
+    assert gait.is_left(left) and not gait.is_left(right)
 
 
 def test_motion_is_seen_in_the_heading_frame(jitted):

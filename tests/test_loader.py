@@ -1,6 +1,7 @@
 """Robots from files: what is derived of small MJCFs whose answers are known, and what is refused."""
 
 import json
+import re
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +11,7 @@ import pytest
 
 import envs
 import ppo_finetune
-from envs import loader
+from envs import anatomy, loader, reader
 from envs.terrain import flat_scene
 from experiment import records
 from tools import check_robot, replay
@@ -249,6 +250,37 @@ def test_a_mesh_that_is_there_becomes_a_fitted_shape(write, tmp_path):
     assert any("collision meshes of trunk" in note for note in body["notes"])
 
 
+def test_a_fit_that_the_file_asks_for_is_kept(write, tmp_path):
+    corners = np.array(np.meshgrid([-0.1, 0.1], [-0.02, 0.02], [-0.02, 0.02])).reshape(3, -1).T
+    (tmp_path / "bar.obj").write_text("".join("v {} {} {}\n".format(*c) for c in corners) + CUBE)
+    text = quadruped().replace('type="box" size="0.2 0.08 0.05"', 'type="sphere" mesh="bar"')
+    body = loader.load(write(text.replace("<worldbody>", '<asset><mesh file="bar.obj"/></asset><worldbody>')))
+    model = mujoco.MjModel.from_xml_string(body["mjcf"])
+    (shape,) = [g for g in range(model.ngeom) if model.geom_bodyid[g] == 1 and model.geom_contype[g]]
+    assert model.geom_type[shape] == mujoco.mjtGeom.mjGEOM_SPHERE
+
+
+@pytest.mark.parametrize("kind", ["obj", "dae"])
+def test_meshes_of_a_ros_package_are_found(kind, tmp_path):
+    """In urdf/ and meshes/ beside each other; MuJoCo cannot read .dae, which counts as missing."""
+    corners = np.array(np.meshgrid([-0.1, 0.1], [-0.02, 0.02], [-0.02, 0.02])).reshape(3, -1).T
+    for name in ("urdf", "meshes"):
+        (tmp_path / "bot" / name).mkdir(parents=True)
+    (tmp_path / f"bot/meshes/bar.{kind}").write_text("".join("v {} {} {}\n".format(*c) for c in corners) + CUBE)
+    shape = f'<geometry><mesh filename="package://bot/meshes/bar.{kind}"/></geometry>'
+    links = f'<link name="a"><collision>{shape}</collision></link><link name="b"/>'
+    text = f'<robot name="bot">{links}<joint name="j" type="fixed"><parent link="a"/><child link="b"/></joint></robot>'
+    (tmp_path / "bot/urdf/bot.urdf").write_text(text)
+    spec = reader.read(tmp_path / "bot/urdf/bot.urdf")
+    assert [reader.loadable(spec, mesh) for mesh in spec.meshes] == [kind == "obj"]
+
+
+def test_contact_begins_at_the_weight_of_the_robot():
+    """At 1 N for shipped robots; one of 0.5 kg stands on six feet with 0.8 N each."""
+    assert {envs.make(task, "c").touch for task in ("go1_loco", "anymal_climb_up", "g1_loco")} == {1.0}
+    assert 0.05 < anatomy.touch(0.5) < 0.2
+
+
 def test_a_body_that_weighs_its_mesh_keeps_its_mass(write, tmp_path):
     """Half of a cube of 0.2 m, cut along a diagonal: 4 kg at 1000 kg/m3, and its centre is that of a triangle."""
     corners = [(x, y, z) for y in (-0.1, 0.1) for x, z in ((-0.1, -0.1), (0.1, -0.1), (-0.1, 0.1))]
@@ -298,6 +330,21 @@ REFUSED = {
         quadruped(more=motors() + '<equality><connect body1="FL_calf" body2="FR_calf" anchor="0 0 0"/></equality>'),
         "closed loops",
     ),
+    "coupled joints": (
+        quadruped(more=motors() + '<equality><joint joint1="FL_calf" joint2="FL_thigh"/></equality>'),
+        "couples FL_calf to other joints",
+    ),
+    "macros": ('<robot xmlns:xacro="http://www.ros.org/wiki/xacro"><xacro:leg/></robot>', "xacro dog.xml > robot.urdf"),
+    "a trunk's frame on the ground": (
+        quadruped().replace('size="0.2 0.08 0.05"', 'size="0.2 0.08 0.05" pos="0 0 1.2"'),
+        "frame of trunk is 0.30 m above the ground",
+    ),
+    "a fixed base on its side": (
+        quadruped(base="", keys=f'<keyframe><key qpos="{"0 0.8 -1.6 " * 4}"/></keyframe>').replace(
+            'name="trunk" pos="0 0 0.3"', 'name="trunk" pos="0 0 0.3" euler="1.5708 0 0"'
+        ),
+        "trunk is tilted by 90 degrees",
+    ),
     "a tendon": (
         quadruped(
             more='<tendon><fixed name="t"><joint joint="FL_calf" coef="1"/></fixed></tendon>'
@@ -315,6 +362,11 @@ REFUSED = {
     ),
     "no mass": (quadruped().replace('mass="0.8"', 'mass="0"'), "mass and inertia", "<inertial>"),
     "two keyframes": (quadruped(keys=f"<keyframe>{TWO}</keyframe>"), "crouch, sleep", "keyframe ="),
+    "two keyframes without names": (
+        quadruped(keys=f"<keyframe>{re.sub('name=.[a-z]*.', '', TWO)}</keyframe>"),
+        "keyframes 0, 1",
+        'keyframe = "0"',
+    ),
     "no keyframe": (quadruped(keys=""), "[pose]", "FL_hip"),
     "a joint without limits": (
         quadruped().replace('axis="1 0 0" range="-0.8 0.8"', 'axis="1 0 0"', 1),
@@ -400,7 +452,7 @@ def test_offset_joints_and_uneven_legs(write):
 
 
 def test_a_dog_walks_through_its_task(bodies):
-    """Stands with zero actions, and mirrored observations follow the tables: twice is once, and feet swap sides."""
+    """Stands with zero actions, and mirrored observations follow the tables: sides swap, and twice is once."""
     env = envs.make("loco", "c", robot=bodies["dog"], noise=0.0, spawn_yaw=0.0)
     state = jax.jit(env.reset)(jax.random.key(0))
     step = jax.jit(env.step)
@@ -408,8 +460,11 @@ def test_a_dog_walks_through_its_task(bodies):
         state = step(state, jnp.zeros(env.action_dim))
         assert not state.terminated
     assert env.motion(state.physics).foot_contact.all()
-    image = env.mirror("left_right", "obs", state.obs)
-    np.testing.assert_array_equal(env.mirror("left_right", "obs", image), state.obs)
+    obs = jax.random.normal(jax.random.key(1), state.obs.shape)
+    image, joints = env.mirror("left_right", "obs", obs), env.obs_slices()["joint_pos"]
+    np.testing.assert_array_equal(env.mirror("left_right", "obs", image), obs)
+    right = obs[joints][jnp.array([3, 4, 5, 0, 1, 2, 9, 10, 11, 6, 7, 8])]
+    np.testing.assert_array_equal(image[joints], right * jnp.array([-1, 1, 1] * 4))  # hips turn the other way
 
 
 def test_without_contact_ends_only_a_tilt_ends_an_episode(write):

@@ -111,7 +111,7 @@ def test_time_out_bootstraps_and_termination_does_not(bootstraps):
         }
     )
     args = dataclasses.replace(ARGS, num_steps=1)
-    _, roll, metrics = script.rollout(args, env, Plain(), {}, state, jax.random.key(0))
+    _, (roll, metrics) = script.rollout(args, env, Plain(), {}, state, jax.random.key(0))
     np.testing.assert_allclose(roll.bootstrap[0], [4.5 if bootstraps else 0.0, 0, 0], rtol=1e-6)
     np.testing.assert_array_equal(roll.done[0], [True, True, False])
     np.testing.assert_array_equal(roll.reward[0], [1, 1, 1])

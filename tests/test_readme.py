@@ -10,13 +10,17 @@ import shlex
 import shutil
 from pathlib import Path
 
+import jax
+import jax.numpy as jnp
 import pytest
 import tyro
 from PIL import Image
 
 import envs
+import play
 from envs import render
 from experiment.run import Run
+from tools import gait
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = {path.relative_to(ROOT).as_posix(): path.read_text() for path in (ROOT / "README.md", *ROOT.glob("docs/*.md"))}
@@ -78,22 +82,43 @@ def workplace(tmp_path_factory):
     return folder
 
 
+TRACED, MEASURED = set(), []
+
+
 class ReadyError(Exception):
     """A training has all it needs: only compiling its program and running it are left."""
 
 
 @pytest.fixture
 def quick(monkeypatch):
-    """Trainings whose results no other command reads end before they are compiled; no picture is drawn."""
-    compile, size = Run.compile, (render.WIDTH, render.HEIGHT)
+    """Trainings whose results no other command reads end before they are compiled; no picture is drawn.
+
+    Each kind of program is traced once. Evaluations, which have tests of their own, find robots that do not move.
+    """
+    compile, size, measure = Run.compile, (render.WIDTH, render.HEIGHT), gait.evaluate
 
     def compile_if_read(self, function, *inputs):
         if self.args.run_dir in READ:
             return compile(self, function, *inputs)
-        function.lower(*inputs)
+        kind = type(self.args), getattr(self.args, "network", None), getattr(self.args, "num_seeds", 1), self.config
+        if repr(kind) not in TRACED:
+            function.lower(*inputs)
+            TRACED.add(repr(kind))
         raise ReadyError
 
+    def evaluate(env, net, params, episodes, level=None):
+        like = jax.eval_shape(env.reset, jax.random.key(0)).replace(key=None)
+        start = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), like)
+        return {}, start, jnp.zeros((env.episode_steps, env.engine.model.nq))
+
+    def measure_once(args):
+        gait.load(args)
+        MEASURED[:] = MEASURED or [measure(args)]
+        return MEASURED[0]
+
     monkeypatch.setattr(Run, "compile", compile_if_read)
+    monkeypatch.setattr(play, "evaluate", evaluate)
+    monkeypatch.setattr(gait, "evaluate", measure_once)
     monkeypatch.setattr(render, "draw", lambda spec, qpos, size=size: [Image.new("RGB", size) for _ in qpos])
 
 

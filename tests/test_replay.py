@@ -49,7 +49,7 @@ def test_targets_of_a_dump_are_those_of_the_delayed_actions():
     state = ppo_finetune.init_state(args, env, net, opt)
     targets = jax.jit(lambda s: replay.trace(args, env, net, s))(state)[2]
     k_roll, _ = jax.random.split(jax.random.fold_in(state.key, state.iteration))
-    roll = jax.jit(lambda s: ppo_finetune.rollout(args, env, net, s.params, s.env, k_roll))(state)[1]
+    roll = jax.jit(lambda s: ppo_finetune.rollout(args, env, net, s.params, s.env, k_roll))(state)[1][0]
     np.testing.assert_allclose(targets[0], np.tile(env.default_pose, (4, 1)))
     np.testing.assert_allclose(targets[1], env.default_pose + env.action_scale * roll.action[0], atol=1e-6)
 

@@ -1,6 +1,7 @@
 """The study trains what is missing, resumes what was interrupted, and stops when its time is over."""
 
 import dataclasses
+import functools
 import json
 
 import pytest
@@ -158,6 +159,7 @@ def test_study_and_report_share_one_table():
     assert {block.scale for block in grid.PLAN} <= grid.SCALES.keys()
 
 
+@functools.cache
 def parsed(task, method, scale):
     """Arguments of ppo_finetune.py for a run of the study, as its command line gives them."""
     words = study.Cell(scale, task, method, 0).words()

@@ -25,7 +25,7 @@ sys.path.insert(0, str(ROOT))
 
 import envs
 from envs import loader, render, terrain
-from envs.anatomy import REFLECTIONS
+from envs.anatomy import REFLECTIONS, touch
 from experiment import devices, records
 
 STEPS, ROBOTS = 250, 4  # random control steps of each of these robots
@@ -50,16 +50,16 @@ def standing_start(model, robot, body):
 
 def stand(model, robot, body):
     """Hold the default pose for 2 s, or until it falls. Numbers by name: what sinks, tilts, strains and touches."""
-    data, up = standing_start(model, robot, body), np.zeros(9)
+    data, up, least = standing_start(model, robot, body), np.zeros(9), touch(body["mass"])
     mujoco.mj_forward(model, data)
     ahead = data.subtree_com[1, :2] - np.mean([data.site(foot).xpos[:2] for foot in body["feet"]], 0)
     while data.time < 2.0:
         mujoco.mj_step(model, data)
         mujoco.mju_quat2Mat(up, data.qpos[3:7])
-        touching = {name: np.linalg.norm(data.sensor(f"{name}_force").data) > 1.0 for name in body["contact_ends"]}
+        touching = {name: np.linalg.norm(data.sensor(f"{name}_force").data) > least for name in body["contact_ends"]}
         if up[8] < np.cos(np.deg2rad(30)) or any(touching.values()):
             break
-    feet = [np.linalg.norm(data.sensor(f"{foot}_force").data) > 1.0 for foot in body["feet"]]
+    feet = [np.linalg.norm(data.sensor(f"{foot}_force").data) > least for foot in body["feet"]]
     return {
         "stands [s]": data.time,
         "sinks [m]": body["height"] - data.qpos[2],

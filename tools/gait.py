@@ -37,7 +37,8 @@ NOMINAL = {  # the task without what makes a training robust; starts still diffe
     "joint_friction": (0.0, 0.0),
     "sensor_lag": (0.0, 0.0),
 }
-DELAY, PUSH, LOAD, SLIPPERY = 0.04, 1.0, 3.0, 0.3  # [s], [m/s], [kg], coefficient of friction
+DELAY, PUSH, SLIPPERY = 0.04, 1.0, 0.3  # [s], [m/s], coefficient of friction
+LOAD, SHARE = 3.0, 0.25  # [kg], of the robot's mass, whichever is less
 PUSH_AT = 0.4  # of an episode
 TESTED = "forward 0.8"  # command of the tests of robustness
 
@@ -156,10 +157,11 @@ def evaluate(args):
         name: gait.schedule(name, env.dt, args.starts, args.seconds) for name in (*gait.COMMANDS, *gait.SEQUENCES)
     }
     tested = gait.schedule(TESTED, env.dt, 2 * args.starts, args.seconds)
+    added = min(LOAD, round(SHARE * facts.mass, 2))
     changes = {
         f"delay of {1000 * DELAY:.0f} ms": {"delay": DELAY},
         f"push of {PUSH} m/s": {"kicks": pushes(steps, 2 * args.starts)},
-        f"{LOAD:.0f} kg more": {"load": LOAD},
+        f"{added:g} kg more": {"load": added},
         f"friction {SLIPPERY}": {"friction": SLIPPERY},
     }
     motions = run(env, net, params, commands | dict.fromkeys(changes, tested), changes)

@@ -42,7 +42,7 @@ class Args:
 def trace(args, env, net, state):
     """One rollout: qpos and qvel before each step, joint targets, and where a step failed; each (T, N, ...)."""
     k_roll, _ = jax.random.split(jax.random.fold_in(state.key, state.iteration))
-    _, roll, _ = ppo_finetune.rollout(args, env, net, state.params, state.env, k_roll)
+    _, (roll, _) = ppo_finetune.rollout(args, env, net, state.params, state.env, k_roll)
 
     def step(before, action):
         after = jax.vmap(env.step)(before, action)

@@ -38,6 +38,7 @@ READINGS = ("lin_vel", "ang_vel", "gravity", "command", "joint_pos", "joint_vel"
 HISTORY = ("prop_history", "action_history")
 UPRIGHT = np.cos(np.deg2rad(60.0))  # of the base's tilt; less is a fall
 LOW = 0.5  # of the standing height; a lower base is a fall
+CONTACT = 1.0  # [N] more at the base is a fall
 DIVERGED = 1e3  # [m, m/s, rad/s] out of reach of any sound simulation
 GEOM, SENSOR = mujoco.mjtGeom, mujoco.mjtSensor
 JOINT, FREE = mujoco.mjtObj.mjOBJ_JOINT, mujoco.mjtJoint.mjJNT_FREE
@@ -467,7 +468,7 @@ def fell(qpos, qvel, base_force, height):
     """True (N,) for robots that tilt too far, are too low, touch the ground with the base, or have diverged."""
     sound = (np.abs(qpos) < DIVERGED).all(1) & (np.abs(qvel) < DIVERGED).all(1)  # NaN is not
     upright = turns(np.where(sound[:, None], qpos, 1.0))[:, 2, 2] > UPRIGHT
-    return ~(sound & upright & (qpos[:, 2] > LOW * height) & ~(np.linalg.norm(base_force, axis=1) > gait.CONTACT))
+    return ~(sound & upright & (qpos[:, 2] > LOW * height) & ~(np.linalg.norm(base_force, axis=1) > CONTACT))
 
 
 def drive(robot, policy, command, seed=0):
