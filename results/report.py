@@ -282,7 +282,7 @@ def batches_table(loaded):
     for task in drawing.WALKING:
         found = drawing.by_scale(loaded, task)
         for scale, runs in found.items() if len(found) > 1 else ():
-            row = {"task": TASKS[task], "batch": drawing.batch(runs), "first weights": SCALES[scale].weights}
+            row = {"task": TASKS[task], "batch": drawing.batch(runs), "initial weights": SCALES[scale].weights}
             row["seeds"] = measures.seeds(runs, TABLE_1)
             for method in ("pidm_pretrained", "mlp"):
                 title = METHODS[method].title.removeprefix("PIDM ")
@@ -359,7 +359,8 @@ def sizes_and_machines(study):
     for task, runs in study.items():
         one = next(iter(runs.values()))[0]
         size = f"{drawing.batch(runs)}, {one['settings']['total_steps'] / 1e6:.1f} M steps"
-        machines = sorted({"{device}, {machine}".format(**run["versions"]) for arm in runs.values() for run in arm})
+        each = [run["versions"] for arm in runs.values() for run in arm]
+        machines = sorted({"{device}, {machine}, jax {jax}".format(**versions) for versions in each})
         lines.append(f"- {drawing.title(task, runs)}: `{task}`, {size}, {'; '.join(machines)}")
     return lines
 

@@ -255,7 +255,7 @@ def test_main_use_is_what_was_recorded():
     row, result = last_row(ROOT / "results" / run), read(run, "eval.json")["task"]
     text = " ".join(README.split())
     assert f"run of {float(row['env_steps']) / 1e6:.0f} M, with 512 environments" in text
-    assert f"first weights, took {float(row['seconds']) / 60:.0f} minutes" in text
+    assert f"initial weights, took {float(row['seconds']) / 60:.0f} minutes" in text
     assert f"velocity by {result['lin_vel_error']:.2f} m/s and fell in {100 * result['falls']:.0f}% of" in text
 
 

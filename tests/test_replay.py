@@ -56,7 +56,7 @@ def test_targets_of_a_dump_are_those_of_the_delayed_actions():
 
 def test_weights_that_are_not_finite_stop_the_run_and_keep_the_last_good_state(tmp_path, refused, capsys):
     out = tmp_path / "run"
-    args = ppo_finetune.Args(preset="smoke", engine="c", run_dir=str(out), lr=1e11, log_every=1)
+    args = ppo_finetune.Args(preset="smoke", engine="c", run_dir=str(out), lr=1e11, max_lr=1e11, log_every=1)
     refused(ppo_finetune.main, args, "not finite after iteration", f"tools/replay.py {out}")
     with (out / "metrics.csv").open() as file:
         count = len(list(csv.DictReader(file)))

@@ -272,9 +272,9 @@ def test_all_machines_of_a_task_are_named():
     runs = {}
     for method, device in {"mlp": "NVIDIA H200", "pidm_random": "cpu", "pidm_pretrained": "cpu"}.items():
         settings = {"num_envs": 2, "num_steps": 5, "total_steps": 3e6}
-        runs[method] = [{"settings": settings, "versions": {"device": device, "machine": "m"}}]
+        runs[method] = [{"settings": settings, "versions": {"device": device, "machine": "m", "jax": "1"}}]
     (line,) = report.sizes_and_machines({"go1_loco": runs})
-    assert line == "- Go1 locomotion: `go1_loco`, 2 x 5, 3.0 M steps, NVIDIA H200, m; cpu, m"
+    assert line == "- Go1 locomotion: `go1_loco`, 2 x 5, 3.0 M steps, NVIDIA H200, m, jax 1; cpu, m, jax 1"
 
 
 def test_rows_of_earlier_tasks_are_marked():
@@ -603,7 +603,7 @@ def test_each_table_takes_the_scale_that_has_most_of_its_methods():
 
 
 def test_what_pretraining_brings_is_drawn_over_the_batch(tmp_path):
-    """A row and a panel a scale, those of 256 environments apart by their first weights; one batch is no figure."""
+    """A row and a panel a scale, those of 256 environments apart by their initial weights; one batch is no figure."""
 
     def arms(num_envs, *ends):
         settings = {"settings": {"num_envs": num_envs, "num_steps": 24}}

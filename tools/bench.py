@@ -309,7 +309,12 @@ def main(args):
 
 def write_page(folder):
     """Write README.md: the tables of every machine."""
-    page = ["# Speed", "", "Made by [`python tools/bench.py`](../../tools/bench.py), which explains the rows."]
+    page = [
+        "# Speed",
+        "",
+        "Made by [`python tools/bench.py`](../../tools/bench.py), which explains the rows. Those of the",
+    ]
+    page += ["Those of the H100 were measured so by a shorter script, beside trainings; it was not kept."]
     for path in sorted(folder.glob("*.json")):
         for part, found in json.loads(path.read_text()).items():
             facts = ", ".join(f"{name} {value}" for name, value in found["machine"].items())

@@ -109,7 +109,7 @@ FAULTS = {  # (file, tests, words for -k) -> faults: name, old text, new text
     ("envs/base.py", "test_rewards", "rollout and go1_loco"): [
         ("an air clock that never resets", "jnp.where(contact, 0.0, self.air_time + dt)", "self.air_time + dt"),
         ("a flight that lands all the time", "jnp.where(contact, self.air_time, 0.0)", "self.air_time"),
-        ("contact from 30 N on", "jnp.linalg.norm(force, axis=-1) > 1.0,", "jnp.linalg.norm(force, axis=-1) > 30.0,"),
+        ("contact from 30 N on", "axis=-1) > self.touch,", "axis=-1) > 30.0,"),
         ("a floor for each step", "self.config.reward_floor * self.dt", "self.config.reward_floor"),
     ],
     ("envs/base.py", "test_rewards", "rollout and g1_loco"): [
