@@ -387,7 +387,7 @@ def test_a_robot_without_a_shipped_checkpoint(pretrained, jitted, tmp_path, monk
     for part in ("actor", "critic"):
         jax.tree.map(np.testing.assert_array_equal, state.params["params"][part], saved["params"][part])
     np.testing.assert_allclose(state.params["params"]["log_std"], calm["log_std"] + 1, err_msg="it explores anew")
-    assert np.isclose(state.lr, 1e-4), "1e-3 would undo in its first update what was learned"
+    assert np.isclose(state.lr, 1e-4), "1e-3 overshoots in the first update"
     assert finetune.merge(args, env.config.ppo).run_dir == "runs/go1_loco/pidm/seed0", "not called random"
     monkeypatch.setitem(envs.TASKS, "stand", (pedipulation.Pedipulation, envs.TASKS["go1_loco"][1]))
     records.save(policy, saved, {"task": "stand", "args": {}})

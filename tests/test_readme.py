@@ -259,6 +259,12 @@ def test_main_use_is_what_was_recorded():
     assert f"velocity by {result['lin_vel_error']:.2f} m/s and fell in {100 * result['falls']:.0f}% of" in text
 
 
+def test_first_rows_of_a_second_training_are_what_was_recorded():
+    rows = csv.DictReader((ROOT / "results/tasks/go1_robust/metrics.csv").read_text().splitlines())
+    first, second = (float(row["kl"]) for row, _ in zip(rows, range(2), strict=False))
+    assert f"have a mean KL of {first:.1f}, the next ten {second:.3f}." in " ".join(DOCS["ppo_finetune"].split())
+
+
 def test_robots_from_files_are_what_was_recorded():
     text = " ".join(DOCS["your-robot"].split())
     for name in ("go2", "h1"):

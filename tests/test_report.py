@@ -312,8 +312,9 @@ def test_only_marked_places_are_filled():
 def recorded(task, method, scale=None):
     """Indicator (K, R) of recorded runs, read from their rows; a reference that shares nothing with the report."""
     curves = []
-    scale = scale or ("batch" if task in ("anymal_loco", "go1_loco", "g1_loco", "anymal_climb_up") else "cpu")
-    for path in sorted((report.ROOT / f"results/study/{scale}" / task / method).glob("seed*/metrics.csv")):
+    study = report.ROOT / "results/study"
+    scale = scale or ("batch" if all((study / "batch" / task / m).exists() for m in report.TABLE_1) else "cpu")
+    for path in sorted((study / scale / task / method).glob("seed*/metrics.csv")):
         with path.open() as file:
             rows = list(csv.DictReader(file))
         curves.append([float(row["progress" if "progress" in rows[0] else "episode_return"]) for row in rows])
@@ -368,6 +369,46 @@ def test_words_of_the_page_are_what_was_recorded():
         assert [len(arm) for arm in runs] == [1, 1], "(n = 1 each)"
         adds.append(100 * (runs[0][:, -7:].mean() / runs[1][:, -7:].mean() - 1))
     assert "With 4096 (n = 1 each) it adds {:.1f}% on Go1 and {:.1f}% on ANYmal D.".format(*adds) in text
+
+
+def test_words_on_the_mlp_are_what_was_recorded():
+    """Against the pretrained PIDM in each task, and its mean gain without the largest one."""
+    text = " ".join((report.ROOT / "results/README.md").read_text().split())
+    above, sooner, gains = 0, 0, []
+    for task in report.TASKS:
+        loaded, mlp, random = (recorded(task, m) for m in ("pidm_pretrained", "mlp", "pidm_random"))
+        ends = [arm[:, -max(arm.shape[1] // 20, 1) :].mean() for arm in (loaded, mlp, random)]
+        reached = [[np.flatnonzero(run >= 0.9 * ends[2]) for run in arm] for arm in (loaded, mlp)]
+        there = [np.mean([found[0] if len(found) else 1e9 for found in arm]) for arm in reached]
+        above += ends[0] > ends[1] * (1 + 1e-9)
+        sooner += there[0] < there[1]
+        gains.append(100 * (ends[1] / ends[2] - 1))
+    assert f"here it ends above it in {above} and is sooner in {sooner}" in text
+    gains.remove(max(gains))
+    assert f"({np.mean(gains):.1f}% without climbing up)" in text
+
+
+def test_words_on_updates_are_what_was_recorded():
+    """Mean change of the actor's backbone in the first 100 iterations, of the seeds that both methods have."""
+    text = " ".join((report.ROOT / "results/README.md").read_text().split())
+
+    def less(scale, task, method, against):
+        runs, each = [{}, {}], (method, against)
+        for name, found in zip(each, runs, strict=True):
+            for path in (report.ROOT / f"results/study/{scale}/{task}/{name}").glob("seed*/metrics.csv"):
+                rows = [row for row in csv.DictReader(path.read_text().splitlines()) if float(row["iteration"]) <= 100]
+                found[path.parent.name] = np.mean([float(row["update/actor/backbone"]) for row in rows])
+        seeds = runs[0].keys() & runs[1].keys()
+        a, b = (np.mean([found[seed] for seed in seeds]) for found in runs)
+        return f"{100 * (1 - a / b):.0f}%"
+
+    both = ("anymal_loco", "go1_loco")
+    shuffled = [less("cpu", task, "pidm_shuffled", "pidm_random") for task in both]
+    loaded = [less("cpu", task, "pidm_pretrained", "pidm_shuffled") for task in both]
+    orthogonal = [less("batch", task, "pidm_random_orthogonal", "pidm_random") for task in both]
+    assert "by {} on ANYmal D and {} on Go1, pretrained".format(*shuffled) in text
+    assert "pretrained ones by {} and {} more".format(*loaded) in text
+    assert "do, too ({} and {}, n = 1)".format(*orthogonal) in text
 
 
 def test_words_on_climbing_up_are_what_was_recorded():
