@@ -91,12 +91,14 @@ def feet_of(path, spec, body, shapes, wishes):
     lowest = {b: min(point[2] - radius for point, radius, _ in some) for b, some in points.items()}
     if not lowest:
         raise ValueError(f"{path}: no shape can touch the ground; add a primitive <geom> to each foot")
-    ground, top = min(lowest.values()), max(point[2] + radius for some in points.values() for point, radius, _ in some)
-    if -ground < 0.25 * (top - ground):
+    ground = min(lowest.values())
+    leaves = [b for b in lowest if not any(b != other and b in ancestors(model, other) for other in lowest)]
+    leg = ancestors(model, min(leaves, key=lowest.get))[:-1]  # from a foot up to the hip
+    length = max((data.xpos[b, 2] for b in leg), default=0.0) - ground
+    if -ground < 0.25 * length:
         base = model.body(1).name
         raise ValueError(f"{path}: the frame of {base} is {-ground:.2f} m above the ground; move it into the trunk")
-    leaves = [b for b in lowest if not any(b != other and b in ancestors(model, other) for other in lowest)]
-    feet = [b for b in leaves if lowest[b] < ground + 0.1 * (top - ground) and b > 1]
+    feet = [b for b in leaves if lowest[b] < ground + 0.1 * length and b > 1]
     if asked := wishes.get("feet"):
         if unknown := [name for name in asked if name not in {model.body(b).name for b in points}]:
             known = ", ".join(model.body(b).name for b in points)

@@ -223,7 +223,7 @@ class Env:
     def failed(self, task, motion):
         """True () if the episode ends in failure: a forbidden body touches the ground, or the trunk tilts too far."""
         force = jnp.linalg.norm(motion.sensors[self.end_sensors], axis=-1)
-        return jnp.any(force > 1.0) | (-motion.gravity[2] < jnp.cos(jnp.deg2rad(self.config.max_tilt)))
+        return jnp.any(force > self.touch) | (-motion.gravity[2] < jnp.cos(jnp.deg2rad(self.config.max_tilt)))
 
     def after_rewards(self, key, task, motion, clock):
         """Update the task state for the next step: draw commands that are due."""

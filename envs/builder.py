@@ -22,6 +22,9 @@ SOLIDS = tuple(PLURAL)
 # --- shapes ---
 
 
+FITTED = dict.fromkeys((GEOM.mjGEOM_MESH, GEOM.mjGEOM_SDF), GEOM.mjGEOM_BOX)  # else what the file asks to fit
+
+
 def simplify(path, spec, notes):
     """Leave what a simulation needs. Shapes that MuJoCo fits replace meshes.
 
@@ -38,7 +41,7 @@ def simplify(path, spec, notes):
         reader.fix_masses(path, spec)
     for geom in meshes:
         if reader.solid(geom):
-            geom.type = GEOM.mjGEOM_BOX if geom.type == GEOM.mjGEOM_MESH else geom.type  # MuJoCo fits it
+            geom.type = FITTED.get(geom.type, geom.type)
             fitted[geom.parent.name] = None
         elif not reader.weighs(spec, geom):
             spec.delete(geom)

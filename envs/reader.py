@@ -23,7 +23,7 @@ def read(path):
         root = ET.parse(path).getroot()
     except (ET.ParseError, LookupError, ValueError) as error:  # the last two: of unknown encodings
         raise ValueError(f"{path} is not an XML file: {one_line(error)}") from None
-    if any("www.ros.org/wiki/xacro" in part.tag or "${" in str(part.attrib) for part in root.iter()):
+    if root.tag == "robot" and any("/xacro}" in part.tag or "${" in str(part.attrib) for part in root.iter()):
         raise ValueError(f"{path} has macros; expand them first: xacro {path.name} > robot.urdf")
     try:
         spec = mujoco.MjSpec.from_file(os.fsencode(path).decode())  # MuJoCo wants UTF-8, whatever the locale
@@ -41,8 +41,9 @@ def find_meshes(path, spec):
     for mesh in [mesh for mesh in spec.meshes if not loadable(spec, mesh)]:
         parts = Path(mesh.file.split("://")[-1]).parts
         tails = [Path(*parts[i:]) for i in range(min(2, len(parts)))]  # the package's own folder may have another name
-        files = (folder / tail for folder in path.resolve().parents for tail in tails)
+        files = (folder / tail for tail in tails for folder in path.resolve().parents)
         mesh.file = str(next((file for file in files if file.is_file()), mesh.file))
+    spec.strippath = False
 
 
 def compiled(path, spec):
@@ -74,18 +75,27 @@ def base_of(path, spec, notes):
         if len(roots) != 1 or roots[0].joints:
             raise ValueError(f"{path} has a fixed base, which cannot walk; add <freejoint/> to the robot's trunk")
         free, (root,) = roots, roots
-        twin = spec.copy()
-        drop(twin, "keys")
-        place = compiled(path, twin).body(root.name)
+        root.name = root.name or "base"
+        place = place_of(path, spec, root.name) if spec.keys else None
         root.add_freejoint()
         for key in spec.keys:
-            key.qpos = [*place.pos, *place.quat, *key.qpos] if len(key.qpos) else []
+            key.qpos = [*place, *key.qpos] if len(key.qpos) else []
             key.qvel = [*[0] * 6, *key.qvel] if len(key.qvel) else []
         notes.append(f"a free joint was added to {root.name}")
     free[0].name = free[0].name or "base"
     for body in spec.bodies:
         name_children(body)
     return free[0].name
+
+
+def place_of(path, spec, name):
+    """Position and quaternion of a body that hangs in the world, whichever way the file gives them."""
+    twin = spec.copy()
+    strip(path, twin, {mesh_name(mesh) for mesh in twin.meshes if not loadable(twin, mesh)})
+    drop(twin, "keys")
+    twin.compiler.fusestatic = False  # else it becomes part of the world
+    body = compiled(path, twin).body(name)
+    return [*body.pos, *body.quat]
 
 
 def name_children(body):
@@ -165,5 +175,5 @@ def mesh_name(mesh):
 
 def loadable(spec, mesh):
     """True if a mesh stands in the file itself, or its own file is there, of a kind that MuJoCo reads."""
-    kind = Path(mesh.file).suffix.lower() in (".stl", ".obj", ".msh")
+    kind = mesh.content_type or Path(mesh.file).suffix.lower() in (".stl", ".obj", ".msh")
     return not mesh.file or (kind and Path(spec.modelfiledir, spec.meshdir, mesh.file).is_file())

@@ -7,6 +7,7 @@
 Legend: T control steps, N episodes side by side, A joints and actions, F feet.
 """
 
+import re
 from dataclasses import dataclass
 
 import numpy as np
@@ -180,9 +181,9 @@ def swings(r, rows, touching, body):
 
 
 def is_left(foot):
-    """True for a left foot, by its name: left_foot, leg_front_left, LF_foot, RL_foot (rear left), LM (middle)."""
-    words = foot.lower().split("_")
-    return "left" in words or words[0] in ("l", *(f"l{end}" for end in "fmhrb"), *(f"{end}l" for end in "fmhrb"))
+    """True for a left foot, by its name: left_foot, leg_l_foot, LF_foot, RL_foot (rear left), LM (middle)."""
+    words = re.split(r"[_-]", foot.lower())
+    return bool({"left", "l"} & {*words} or re.fullmatch(r"l[fmhrb]|[fmhrb]l", words[0]))
 
 
 def feet(r, rows, body):

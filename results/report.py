@@ -273,7 +273,7 @@ def early_updates(runs, method, against):
     name = "update/actor/backbone"
     if any(name not in run["columns"] for m in (method, against) for run in runs[m]):
         return ""
-    return f"{100 * (measures.early_ratio(name, runs[method], runs[against]) - 1):+.0f}"
+    return f"{100 * (measures.early_ratio(name, runs[method], runs[against]) - 1):+z.0f}"
 
 
 def batches_table(loaded):
@@ -305,9 +305,9 @@ def updates_table(study):
         }
         step = ratio.pop("lr")
         row = {"task": drawing.title(task, runs), "seeds": measures.seeds(runs, ("pidm_pretrained", "pidm_random"))}
-        row |= {name.split("/")[-1].replace("_", " "): f"{100 * (x - 1):+.0f}" for name, x in ratio.items()}
-        row |= {"step size": f"{100 * (step - 1):+.0f}"}
-        row |= {"backbone per step size": f"{100 * (ratio['update/actor/backbone'] / step - 1):+.0f}"}
+        row |= {name.split("/")[-1].replace("_", " "): f"{100 * (x - 1):+z.0f}" for name, x in ratio.items()}
+        row |= {"step size": f"{100 * (step - 1):+z.0f}"}
+        row |= {"backbone per step size": f"{100 * (ratio['update/actor/backbone'] / step - 1):+z.0f}"}
         rows.append(row)
     return markdown(rows)
 

@@ -58,6 +58,27 @@ def jitted():
     return functools.cache(Jitted)
 
 
+def compiled_at_its_calls(make, programs):
+    """`make`, whose functions are compiled for each shape when they are called, but no program twice."""
+
+    def made(args, env, *rest):
+        function, found = make(args, env, *rest), {}
+        if not hasattr(env, "config"):  # a stand-in
+            return function
+
+        def call(*inputs):
+            shapes = tuple(jnp.shape(x) for x in jax.tree.leaves(inputs))
+            if shapes not in found:
+                lowered = function.lower(*inputs)
+                key = make.__name__, repr(env.config), args.noise, lowered.as_text()
+                found[shapes] = programs[key] = programs.get(key) or lowered.compile()
+            return found[shapes](*inputs)
+
+        return call
+
+    return made
+
+
 @pytest.fixture(scope="session", autouse=True)
 def compiled_once():
     """Trainings whose program and environment are the same to the letter share one compilation."""
@@ -71,28 +92,10 @@ def compiled_once():
             programs[key] = lowered.compile()
         return programs[key]
 
-    def compiled_at_its_calls(make):
-        """The same for functions of stage 2, which are compiled for each shape when they are called."""
-
-        def made(args, env, *rest):
-            function, found = make(args, env, *rest), {}
-
-            def call(*inputs):
-                shapes = tuple(jnp.shape(x) for x in jax.tree.leaves(inputs))
-                if shapes not in found:
-                    lowered = function.lower(*inputs)
-                    key = make.__name__, repr(env.config), args.noise, lowered.as_text()
-                    found[shapes] = programs[key] = programs.get(key) or lowered.compile()
-                return found[shapes](*inputs)
-
-            return call
-
-        return made
-
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Run, "compile", compile)
         for make in (pretrain_pidm.make_step, pretrain_pidm.make_predictor):
-            patch.setattr(pretrain_pidm, make.__name__, compiled_at_its_calls(make))
+            patch.setattr(pretrain_pidm, make.__name__, compiled_at_its_calls(make, programs))
         yield
 
 

@@ -227,9 +227,11 @@ def test_a_recorded_policy_from_end_to_end(tmp_path, capsys):
     assert 0.05 < of["forward 0.8"]["torque_rms"] < 1 and 0.5 < of["forward 0.8"]["foot_force"] < 5
 
 
-@pytest.mark.parametrize("left", ["left_foot", "leg_front_left_foot", "LF_foot", "RL_calf_foot", "BL_foot", "LM_foot"])
+@pytest.mark.parametrize(
+    "left", ["left_foot", "leg_front_left_foot", "LF_foot", "RL_calf_foot", "BL_foot", "LM_foot", "leg_l_foot"]
+)
 def test_left_feet_are_known_by_their_names(left):
-    right = left.replace("left", "right").replace("L", "R") if "R" not in left else "RR_calf_foot"
+    right = left.replace("left", "right").replace("_l_", "_r_").replace("L", "R")
     assert gait.is_left(left) and not gait.is_left(right)
 
 

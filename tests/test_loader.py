@@ -192,6 +192,30 @@ def test_a_trunk_without_joint_becomes_free(write):
     assert body["digest"] == free["digest"] and any("free joint" in note for note in body["notes"])
 
 
+def test_a_hanging_trunk_that_lacks_a_mesh_and_a_name_becomes_free(write):
+    keys = f'<keyframe><key qpos="{"0 0.8 -1.6 " * 4}"/></keyframe>'
+    mesh = '<geom type="mesh" mesh="part" contype="0" conaffinity="0" mass="0"/><geom name="trunk"'
+    text = quadruped(base="", keys=keys).replace('<body name="trunk"', "<body").replace('<geom name="trunk"', mesh, 1)
+    text = text.replace("<worldbody>", '<asset><mesh name="part" file="part.dae"/></asset><worldbody>')
+    body = loader.load(write(text))
+    assert body["base"] == "base" and len(body["joints"]) == 12 and len(body["feet"]) == 4
+
+
+def test_a_urdf_whose_meshes_are_missing(write):
+    """Two legs that swing below a trunk."""
+    solid = '<inertial><mass value="{}"/><inertia ixx=".1" iyy=".1" izz=".1" ixy="0" ixz="0" iyz="0"/></inertial>'
+    ball = '<collision><origin xyz="0 0 -0.4"/><geometry><sphere radius="0.03"/></geometry></collision>'
+    look = '<visual><geometry><mesh filename="package://bot/meshes/trunk.dae"/></geometry></visual>'
+    text = f'<robot name="bot"><link name="trunk">{solid.format(5)}{look}</link>'
+    for side, y in (("left", 0.1), ("right", -0.1)):
+        text += f'<link name="{side}_leg">{solid.format(1)}{ball}</link><joint name="{side}_hip" type="revolute">'
+        text += f'<parent link="trunk"/><child link="{side}_leg"/><origin xyz="0 {y} 0"/><axis xyz="0 1 0"/>'
+        text += '<limit lower="-1" upper="1" effort="30" velocity="9"/></joint>'
+    body = loader.load(write(text + "</robot>", "pose = { hip = 0.0 }", "bot.urdf"))
+    assert body["base"] == "trunk" and body["joints"] == ["left_hip", "right_hip"]
+    np.testing.assert_allclose([body["mass"], body["height"]], [7.0, 0.43], atol=1e-6)
+
+
 def test_the_scene_stays_behind(write):
     """Ground, lights, materials and the like, of which some name files that are not there."""
     plain = quadruped()
@@ -336,8 +360,8 @@ REFUSED = {
     ),
     "macros": ('<robot xmlns:xacro="http://www.ros.org/wiki/xacro"><xacro:leg/></robot>', "xacro dog.xml > robot.urdf"),
     "a trunk's frame on the ground": (
-        quadruped().replace('size="0.2 0.08 0.05"', 'size="0.2 0.08 0.05" pos="0 0 1.2"'),
-        "frame of trunk is 0.30 m above the ground",
+        re.sub(r'(_hip" pos="[^ ]* [^ ]*) 0"', r'\1 0.28"', quadruped()),
+        "frame of trunk is 0.05 m above the ground",
     ),
     "a fixed base on its side": (
         quadruped(base="", keys=f'<keyframe><key qpos="{"0 0.8 -1.6 " * 4}"/></keyframe>').replace(

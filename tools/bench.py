@@ -309,11 +309,7 @@ def main(args):
 
 def write_page(folder):
     """Write README.md: the tables of every machine."""
-    page = [
-        "# Speed",
-        "",
-        "Made by [`python tools/bench.py`](../../tools/bench.py), which explains the rows. Those of the",
-    ]
+    page = ["# Speed", "", "Made by [`python tools/bench.py`](../../tools/bench.py), which explains the rows."]
     page += ["Those of the H100 were measured so by a shorter script, beside trainings; it was not kept."]
     for path in sorted(folder.glob("*.json")):
         for part, found in json.loads(path.read_text()).items():
