@@ -243,6 +243,7 @@ def export_onnx(args):
         # of the input `phase`
         **({name: getattr(env.config, name) for name in ("gait_hz", "march")} if "phase" in shapes else {}),
         "versions": records.versions(),
+        "trained_with": meta.get("versions"),
     }
     onnx.helper.set_model_props(model, {name: json.dumps(value) for name, value in facts.items()})
     records.write(Path(args.export), model.SerializeToString())

@@ -38,7 +38,7 @@ class Args:
     data: str = "runs/explore/go1/seed0"  # folder of a finished ppo_explore.py
     preset: Literal["smoke", "cpu", "gpu"] = "cpu"  # scale
     seed: int = 0  # the only source of randomness
-    eval: str | None = None  # validate this pidm.msgpack on --data instead of training; figures go beside it
+    eval: str | None = None  # validate this pidm.msgpack on held-out data of --data, not train; figures go beside it
     # --- Records ---
     run_dir: str | None = None  # None: runs/pidm/<robot>/seed<seed>
     force: bool = False  # overwrite the run in that folder
@@ -274,14 +274,14 @@ def l1_loss(net, variables, batch):
 # --- Training ---
 
 
-def decay(args, past):
+def decay(args, val_errors):
     """Return the epochs at which the step size starts to fall and is 0, given the validation errors of past epochs.
 
     With --patience it starts once so many epochs brought no lower error, or when only so many are left; else at once.
     """
     if args.patience is None:
         return 0, args.epochs
-    flat = (n for n in range(1, len(past) + 1) if n - 1 - np.argmin(past[:n]) >= args.patience)
+    flat = (n for n in range(1, len(val_errors) + 1) if n - 1 - np.argmin(val_errors[:n]) >= args.patience)
     start = min(next(flat, args.epochs), args.epochs - args.patience)
     return start, start + args.patience
 
@@ -300,10 +300,10 @@ def make_step(args, env, net, opt):
     return step
 
 
-def run_epoch(args, data, index, step, state, past):
+def run_epoch(args, data, index, step, state, val_errors):
     """One pass over the training transitions, in an order that (seed, epoch) alone decides. Also the mean loss."""
-    (variables, opt_state), epoch = state, len(past)
-    start, end = decay(args, past)
+    (variables, opt_state), epoch = state, len(val_errors)
+    start, end = decay(args, val_errors)
     order = np.random.default_rng((args.seed, epoch)).permutation(index)
     size = min(args.batch, len(order) // jax.device_count() * jax.device_count())
     whole = len(order) - len(order) % size  # no ragged last batch
@@ -334,7 +334,7 @@ def pretrain(args):
     if not (least := jax.device_count()) <= count <= len(data.train):
         raise records.UserError(f"--num-samples {count} is not from {least} to the {len(data.train)} in {args.data}")
     index = np.random.default_rng(args.seed).permutation(data.train)[:count]
-    few = np.sort(np.random.default_rng(args.seed).permutation(data.validation)[:50_000])
+    validated = np.sort(np.random.default_rng(args.seed).permutation(data.validation)[:50_000])
     print(f"{env.robot.name}: {count} transitions to train on, {len(data.validation)} to validate")
     net, opt = PIDM(SIZES[env.robot.like], env.action_dim), optax.scale_by_adam()
 
@@ -346,18 +346,18 @@ def pretrain(args):
     (state,), (folder,) = run.start(init), run.folders
     state = devices.place(state, jax.tree.map(lambda _: devices.same(), state))
     step, predictor = make_step(args, env, net, opt), make_predictor(args, env, net)
-    past = [row["error"] for row in run.rows[0]]
+    val_errors = [row["error"] for row in run.rows[0]]
     with run:
-        while not run.done and run.iteration < decay(args, past)[1]:
+        while not run.done and run.iteration < decay(args, val_errors)[1]:
             epoch = run.iteration + 1
-            state, loss = run_epoch(args, data, index, step, state, past)
+            state, loss = run_epoch(args, data, index, step, state, val_errors)
             row = {"iteration": epoch, "samples": count * epoch, "seconds": run.seconds(), "train_error": loss}
-            row = metrics.rounded(row | errors(env, data, predict_all(predictor, env, state[0], data, few)))
+            row = metrics.rounded(row | errors(env, data, predict_all(predictor, env, state[0], data, validated)))
             run.add([row])
-            past.append(row["error"])
+            val_errors.append(row["error"])
             if not np.isfinite(loss):
                 raise records.UserError(f"the error is not finite after epoch {epoch}; lower --lr")
-            if folder and row["error"] == min(past):
+            if folder and row["error"] == min(val_errors):
                 records.save(folder / "pidm.msgpack", state[0], checkpoint_meta(args, env, data, net.sizes, row))
             run.save([state])
     run.report_interrupt()
@@ -392,7 +392,7 @@ def checkpoint_meta(args, env, data, sizes, row):
 
 
 def commanded_change(env, x, action):
-    """Joint target minus joint angle, a_t - q_t [rad]: the paper's action. x (..., X), action (..., A)."""
+    """Joint target minus joint angle, a_t - q_t [rad]; its size is the paper's action magnitude (Fig. 4b, c)."""
     # joint_pos is relative to the default pose, and so is the target
     return np.float32(env.robot.action_scale) * action - x[..., env.prop_slices()["joint_pos"]]
 
@@ -444,14 +444,14 @@ def validate(predictor, env, variables, data, folder):
     at = np.divmod(index[:: max(len(index) // 50_000, 1)], data.x.shape[1])
     size = np.abs(commanded_change(env, data.x[at], data.action[at]))
     figures.plot_distribution(size, data.rough[at], folder / "distribution.png")
-    print("validation:", records.line(result))
-    print(f"wrote {folder}/validation.json, accuracy.png, distribution.png")
+    print(f"validation: {records.line(result)}\nwrote {folder}/validation.json, accuracy.png, distribution.png")
 
 
 def run_validation(args):
     """Validate the PIDM of --eval on the collection --data. UserError if the two do not fit."""
-    path = Path(args.eval)
-    if not path.is_file():
+    if args.run_dir or args.resume:
+        raise records.UserError("--eval writes beside its PIDM; leave out --run-dir and --resume")
+    if not (path := Path(args.eval)).is_file():
         raise records.UserError(f"--eval {path}: there is no such file")
     data, env = open_data(args)
     net = PIDM(SIZES[env.robot.like], env.action_dim)

@@ -22,6 +22,7 @@ NOISE = {"lin_vel": 0.1, "ang_vel": 0.2, "gravity": 0.05, "joint_pos": 0.01, "jo
 # Blocks of x_t, in order -> mirror kind.
 PROP = {"ang_vel": "axial", "gravity": "polar", "joint_pos": "joint", "joint_vel": "joint"}
 # Blocks of an observation about the robot itself -> (mirror kind, fixed scale), as in `Env.OBS`.
+# Deviation (input scaling): velocities and commands as in legged_gym, the last action ours. Isaac Lab feeds inputs raw.
 BODY = {
     "lin_vel": ("polar", 2.0),
     "ang_vel": ("axial", 0.25),
@@ -49,7 +50,7 @@ class State:
     final_obs: jax.Array  # (O,)
     final_history: dict
     action: jax.Array  # (A,) of the last step, 0 at the start
-    clock: jax.Array  # () control steps since the episode began
+    clock: jax.Array  # () control step in the episode's time; an episode may start midway, see `reset`
     push_at: jax.Array  # () clock of the next push
     delay: jax.Array  # () [control steps] from an action to its joint targets
     lag: jax.Array  # () [control steps] age of the readings, 0 to 1
@@ -71,7 +72,10 @@ class Course:
 
 @flax.struct.dataclass
 class Motion:
-    """True motion: kinematics from qpos and qvel, forces and feet from the engine's sensors."""
+    """True motion: kinematics from qpos and qvel, forces and feet from the engine's sensors.
+
+    At a reset nothing has been measured: feet, forces, torques and accelerations are 0 then.
+    """
 
     lin_vel: jax.Array  # (3,) base velocity, base frame [m/s]
     ang_vel: jax.Array  # (3,) base frame [rad/s]

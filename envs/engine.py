@@ -123,7 +123,8 @@ class Engine:
         m = self.model
         sliding = xp.where(self.robot_geoms, friction[..., None], m.geom_friction[:, 0])
         rest = xp.broadcast_to(m.geom_friction[:, 1:], (*sliding.shape, 2))
-        # Constants of the constraint regularisation that depend on mass (mj_setConst) keep their nominal values.
+        # Constants of the constraint regularisation that depend on mass (mj_setConst) keep their nominal values, and so
+        # does body_subtreemass, which only moves the point about which spatial vectors are taken.
         return {
             "geom_friction": xp.concatenate([sliding[..., None], rest], -1),
             "body_mass": m.body_mass * mass_scale,

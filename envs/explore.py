@@ -57,7 +57,8 @@ class Explore(Env):
 
     def on_rough(self, physics):
         """True (...) if the base is over the rough ground."""
-        return jnp.abs(physics.qpos[..., 0] - terrain.ROUGH_CENTRE) < terrain.ROUGH_HALF
+        away = jnp.abs(physics.qpos[..., :2] - jnp.array([terrain.ROUGH_CENTRE, 0.0]))
+        return (away < terrain.ROUGH_HALF).all(-1) & (self.config.rough > 0)
 
     def push(self, key, physics, clock, push_at):
         """Push as in every task, and now and then change the force on the base."""

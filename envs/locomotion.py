@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from envs import rewards
-from envs.base import Env, FootClocks, joint_indices, select, soft_limits, uniform
+from envs.base import BODY, Env, FootClocks, joint_indices, select, soft_limits, uniform
 from envs.config import Config, Range
 from envs.rotations import axis_angle, inverse, rotate, wrap
 
@@ -48,27 +48,23 @@ class Task(FootClocks):
 
     command: jax.Array  # (3,) forward [m/s], sideways [m/s], turning [rad/s], base frame
     heading: jax.Array  # () commanded yaw [rad]
-    moves: jax.Array  # () bool: not a command to stand still
+    moves: jax.Array  # () bool: not drawn to stand still; it may yet be slower than `rewards.moving`
     steers: jax.Array  # () bool: the heading sets the turning rate
     remaining: jax.Array  # () control steps until the next command
     velocity: jax.Array  # (3,) low-passed forward, sideways [m/s] and turning [rad/s]
 
 
+ORDER = ("lin_vel", "ang_vel", "gravity", "command", "joint_pos", "joint_vel", "action")  # of the observation
+
+
 class Locomotion(Env):
-    # Deviation (input scaling): as in legged_gym. Isaac Lab feeds inputs raw.
-    OBS = {
-        "lin_vel": ("polar", 2.0),
-        "ang_vel": ("axial", 0.25),
-        "gravity": ("polar", 1.0),
-        "command": ("planar", (2.0, 2.0, 0.25)),
-        "joint_pos": ("joint", 1.0),
-        "joint_vel": ("joint", 0.05),
-        "action": ("joint", 0.5),
-    }
+    OBS = {name: BODY.get(name, ("planar", (2.0, 2.0, 0.25))) for name in ORDER}
     SHOWCASE_FIELDS = {"fixed_velocity": (0.8, 0.0), "spawn_yaw": 0.0, "spawn_xy": 0.0}
-    COMMAND_RANGES = {"forward [m/s]": (-1.0, 1.0), "sideways [m/s]": (-1.0, 1.0), "turning [rad/s]": (-1.0, 1.0)}
 
     def __init__(self, config, engine="auto"):
+        turning = (-config.yaw_rate, config.yaw_rate)  # what a person may ask for is what it was trained with
+        ranges = {"forward [m/s]": config.lin_vel_x, "sideways [m/s]": config.lin_vel_y, "turning [rad/s]": turning}
+        self.COMMAND_RANGES = ranges
         if config.gait_hz:
             self.OBS = self.OBS | {"phase": ("phase", 1.0)}
         super().__init__(config, engine)
@@ -217,9 +213,6 @@ class G1Locomotion(Locomotion):
         return jnp.append(lin_vel[:2], ang_vel[2])
 
 
-# Deviation (reward weights): Isaac Lab's make every early return negative at CPU batch sizes: robots learn to fall.
-# So roll_pitch_rate, torque and joint_acc weigh a quarter, being alive is rewarded, and the total has a floor. air_time
-# counts from 0.1 s. slip and pose keep quadrupeds from dragging their feet.
 # Deviation (entropy bonus): none (Isaac Lab: 0.005 to 0.01). With it the policy comes to depend on its own noise.
 BLIND_QUADRUPED = {
     "hidden": (128, 128, 128),
@@ -263,6 +256,9 @@ STEPS = {  # high, even steps with feet that do not slide, and rest where the co
     "alive": 0.5,
 }
 
+# Deviation (reward weights): Isaac Lab's make every early return negative at CPU batch sizes: robots learn to fall.
+# So being alive is rewarded and the total has a floor; on quadrupeds roll_pitch_rate, torque and joint_acc weigh a
+# quarter, air_time counts from 0.1 s, and slip and pose keep them from dragging their feet.
 ANYMAL_WEIGHTS = {
     "track_lin_vel": 1.0,
     "track_yaw_rate": 0.5,

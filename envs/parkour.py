@@ -82,6 +82,8 @@ class Parkour(Env):
     def __init__(self, config, engine="auto"):
         if config.level is not None and not 0 <= config.level < self.LEVELS:
             raise ValueError(f"level {config.level} does not exist; choose 0 to {self.LEVELS - 1}")
+        if config.random_seconds > config.episode_seconds:
+            raise ValueError(f"random_seconds must be at most episode_seconds, {config.episode_seconds:g}")
         if config.skill not in SKILLS:
             raise ValueError(f"unknown skill {config.skill!r}; choose one of {', '.join(SKILLS)}")
         self.skill = SKILLS[config.skill]

@@ -46,9 +46,9 @@ class Task:
 class Pedipulation(Env):
     OBS = BODY | {"target": ("polar", 1.0)}
     SHOWCASE_FIELDS = {"fixed_point": (0.7, -0.2, 0.5)}
-    COMMAND_RANGES = {"x [m]": (0.0, 1.0), "y [m]": (-0.4, 0.2), "z [m]": (-0.1, 1.3)}
 
     def __init__(self, config, engine="auto"):
+        self.COMMAND_RANGES = dict(zip(("x [m]", "y [m]", "z [m]"), config.box, strict=True))
         super().__init__(config, engine)
         if config.foot not in self.robot.feet:
             raise ValueError(f"unknown foot {config.foot!r}; choose one of {', '.join(self.robot.feet)}")

@@ -86,7 +86,8 @@ def video(env, qpos, course, path, title="", markers=()):
         frames = b"".join(image.tobytes() for image in images)
         encoder = subprocess.run([*command, str(mp4)], input=frames, capture_output=True, text=False, check=False)
         if encoder.returncode:
-            raise ValueError(f"ffmpeg could not make {path}: {encoder.stderr.decode().strip().splitlines()[-1]}")
+            said = encoder.stderr.decode().strip().splitlines() or [f"exit code {encoder.returncode}"]
+            raise ValueError(f"ffmpeg could not make {path}: {said[-1]}")
         return mp4.read_bytes()
 
 

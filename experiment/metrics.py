@@ -48,8 +48,8 @@ def make_row(args, iteration, seconds, metrics):
 
 
 def rounded(row):
-    """A row of plain floats with six digits."""
-    return {name: float(f"{float(value):.6g}") for name, value in row.items()}
+    """A row of plain numbers: counts whole, others with six digits."""
+    return {name: x if type(x) is int else float(f"{float(x):.6g}") for name, x in row.items()}
 
 
 def mean_row(rows):

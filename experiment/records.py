@@ -204,7 +204,7 @@ def start_runs(each, config):
     older run are removed, so that a new one that is stopped early cannot be taken for it.
     """
     for args in each:
-        if any((Path(args.run_dir) / name).exists() for name in RESULTS) and not args.force:
+        if any((Path(args.run_dir) / name).exists() for name in (*RESULTS, "meta.json")) and not args.force:
             raise UserError(
                 f"{args.run_dir} holds a run; pass --force to overwrite it, or --run-dir for another folder"
             )
@@ -270,6 +270,7 @@ RESULTS = (
     "validation.json",
     "rollout.png",
     "rollout.gif",
+    "nan.npz",
 )
 
 
@@ -388,7 +389,7 @@ def resumed(args, *may_change):
             f"{path} is of another version or stage, which differs in {', '.join(other)[:99]}; start the run again"
         )
     found = {f.name: tuple(record[f.name]) if isinstance(record[f.name], list) else record[f.name] for f in fields}
-    found |= {"robot": str(path)} if from_file else {}  # the file may have changed since
+    found |= {"robot": str(path)} if from_file and "robot" in found else {}  # the file may have changed since
     return type(args)(**found | given | {"resume": args.resume, "run_dir": args.resume, "force": False})
 
 

@@ -162,7 +162,7 @@ class Run:
         if jax.process_count() == 1:
             for folder, state, rows in zip(self.folders, states, self.rows, strict=True):
                 records.save_state(folder, state, rows)
-            self.saved = time.perf_counter()
+        self.saved = time.perf_counter()
 
     def finish(self, states):
         """Save the states (S, ...), and draw the curves of each seed."""

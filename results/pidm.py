@@ -39,7 +39,7 @@ from results import recording
 SIZES = (7_000, 70_000, 700_000)  # transitions; the fourth of the paper's sizes, 7 M, is the whole collection
 EXPLORE = ("--total-steps", "7600000")
 PRETRAIN = ("--epochs", "100", "--patience", "10")
-BLIND = ("anymal_loco", "anymal_pedipulation", "go1_loco", "g1_loco")  # tasks on flat ground without perception
+BLIND = tuple(name for name, (family, _) in envs.TASKS.items() if not family.LEVELS)  # tasks on flat ground
 EARLY = 100  # iterations of a task's training whose states the coverage figure shows (paper Fig. 4a)
 
 
@@ -253,7 +253,8 @@ def look(robot):
     coverage |= measure_novelty(
         env, pretrain_pidm.Dataset(ROOT / f"runs/explore/{robot}/seed0"), folder / "novelty.png"
     )
-    coverage[f"normalized_error, recorded policy of {tasks[0]}"] = walking_error(robot, tasks[0])
+    for task in [task for task in tasks if (ROOT / f"results/tasks/{task}/policy.msgpack").exists()][:1]:
+        coverage[f"normalized_error, recorded policy of {task}"] = walking_error(robot, task)
     name, points = project([x[::5] for x in kinds.values()])
     found = draw_coverage(dict(zip(kinds, points, strict=True)), f"{name} of x_t, {robot}", folder / "coverage.png")
     coverage |= {f"where exploration has been on the map, {kind}": share for kind, share in found.items()}
@@ -325,7 +326,7 @@ def commands(robot, explored, trained):
 def write_readme():
     """Write results/pidm/README.md from the kept files of all robots."""
     lines, first = [], []
-    for folder in sorted(path for path in (ROOT / "results/pidm").iterdir() if path.is_dir()):
+    for folder in sorted(path.parent for path in (ROOT / "results/pidm").glob("*/validation.json")):
         meta, result = (json.loads((folder / name).read_text()) for name in ("explore/meta.json", "validation.json"))
         for extra in (folder / "coverage.json", folder / "features.json"):
             result |= json.loads(extra.read_text()) if extra.exists() else {}

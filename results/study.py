@@ -13,7 +13,6 @@ report.py reads them. Scales never mix.
 
 import csv
 import json
-import signal
 import sys
 import time
 from dataclasses import dataclass
@@ -71,16 +70,24 @@ class Cell:
         return [*words, "--run-dir", f"runs/{self.folder}", "--force"]
 
     def done(self):
-        """Share of its steps that the run has made, 1 once its files are kept, None before its first row."""
-        if all((ROOT / "results" / self.folder / name).exists() for name in KEPT):
-            return 1.0
+        """True once the run's files are kept."""
+        return all((ROOT / "results" / self.folder / name).exists() for name in KEPT)
+
+    def share(self):
+        """Share of its steps that the run has made, None before its first row."""
         run = ROOT / "runs" / self.folder
         try:
             with (run / "metrics.csv").open() as file:
                 rows = list(csv.DictReader(file))
-            return min(float(rows[-1]["env_steps"]) / json.loads((run / "args.json").read_text())["total_steps"], 0.99)
+            return float(rows[-1]["env_steps"]) / json.loads((run / "args.json").read_text())["total_steps"]
         except (OSError, ValueError, KeyError, IndexError):
             return None
+
+    def lacks(self):
+        """The PIDM that the run would start from, if it is not there."""
+        words = self.words()
+        path = words[words.index("--pretrained") + 1] if "--pretrained" in words else ""
+        return path if not (ROOT / path).exists() else None
 
 
 def planned(args):
@@ -116,12 +123,12 @@ def show_status(runs):
         print(f"{block.scale}: {block.why}")
         marks = {}
         for cell in cells:
-            done = cell.done()
-            mark = "." if done is None else "x" if done == 1.0 else f"{100 * done:.0f}%"
+            share = cell.share()
+            mark = "x" if cell.done() else "." if share is None else f"{min(100 * share, 99):.0f}%"
             marks.setdefault((cell.task, cell.method), []).append(mark)
         for (task, method), seeds in marks.items():
             print(f"  {task:20}{method:28}{' '.join(seeds)}")
-    every = [cell.done() == 1.0 for cells in runs.values() for cell in cells]
+    every = [cell.done() for cells in runs.values() for cell in cells]
     print(f"{sum(every)} of {len(every)} runs")
 
 
@@ -130,7 +137,7 @@ def run(cell, seconds):
     log = ROOT / "runs" / cell.folder / "log.txt"
     log.parent.mkdir(parents=True, exist_ok=True)
     with log.open("a") as file:
-        if not recording.finetune(cell.words(), file, seconds):
+        if not recording.finetune(cell.words(), file, seconds) or cell.share() < 1:  # one that was stopped ends well
             return False
         recording.evaluate(cell.folder, ROOT / "results" / cell.folder, KEPT, file)
     return True
@@ -140,21 +147,22 @@ def main(args):
     runs = planned(args)
     if args.status:
         return show_status(runs)
-    missing = [cell for cells in runs.values() for cell in cells if cell.done() != 1.0]
+    missing = [cell for cells in runs.values() for cell in cells if not cell.done()]
+    for path in dict.fromkeys(filter(None, (cell.lacks() for cell in missing))):
+        print(f"left out: runs from {path}, which is missing; results/pidm.py makes it", file=sys.stderr)
     start = time.perf_counter()
-    for cell in missing:
+    for cell in [cell for cell in missing if not cell.lacks()]:
         left = 60 * args.budget_minutes - (time.perf_counter() - start)
         if args.list:
             words = f"--tasks {cell.task} --methods {cell.method} --seeds {cell.seed} --scales {cell.scale}"
             print(f"python results/study.py {words}")
         elif left <= 0 or not run(cell, left):
-            return print("out of time; the same command goes on")
+            return print("out of time, or stopped; the same command goes on")
         else:
             print(f"ran {cell.folder}  {(time.perf_counter() - start) / 60:.1f} min", flush=True)
     return None
 
 
 if __name__ == "__main__":
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # it stops the run under way, too
-    with records.one_line_errors():
+    with records.one_line_errors():  # SIGTERM stops the run under way, too
         main(tyro.cli(Args, description=__doc__))

@@ -8,7 +8,9 @@ import signal
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -65,6 +67,11 @@ def test_robots_start_on_the_ground(robot):
     scales = np.asarray(physics.mass_scale)[:, 2:]
     assert 0.85 <= scales.min() < 0.9 and 1.1 < scales.max() <= 1.15
     assert np.ptp(np.asarray(physics.friction)) > 0.7
+
+
+def test_rough_ground_has_an_end(go1):
+    where = jnp.array([[7.5, 0.0, 0.3], [7.5, 9.0, 0.3], [-1.0, 0.0, 0.3]])
+    assert go1.on_rough(SimpleNamespace(qpos=where)).tolist() == [True, False, False]
 
 
 def test_forces_come_and_go(go1):
@@ -135,7 +142,8 @@ def test_ensemble_learns_and_disagreement_shrinks(fitted):
     assert losses[-1] < losses[0] - 0.5
 
     def doubt(weights, batch):
-        return float(script.disagreement(script.predict(member, weights, ensemble.norm, batch)[0]).mean())
+        each = jax.vmap(partial(script.predict, member), (0, None, None))
+        return float(script.disagreement(each(weights, ensemble.norm, batch)[0]).mean())
 
     known, novel = doubt(ensemble.params, buffer), doubt(ensemble.params, toy(jax.random.key(5), 512, spread=3.0))
     assert known < 0.5 * doubt(params, buffer) and novel > 2 * known
@@ -144,7 +152,7 @@ def test_ensemble_learns_and_disagreement_shrinks(fitted):
 def test_equal_members_do_not_disagree(fitted):
     member, params, ensemble, _, buffer = fitted
     same = jax.tree.map(lambda x: jnp.repeat(x[:1], 3, 0), params)
-    mean, _ = script.predict(member, same, ensemble.norm, buffer)
+    mean, _ = jax.vmap(partial(script.predict, member), (0, None, None))(same, ensemble.norm, buffer)
     np.testing.assert_allclose(script.disagreement(mean), 0.0, atol=1e-10)
 
 

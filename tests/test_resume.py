@@ -128,6 +128,15 @@ def test_a_clock_that_jumps_changes_nothing_but_the_seconds(whole, tmp_path, mon
     jax.tree.map(np.testing.assert_array_equal, *states)
 
 
+def test_stage_two_of_a_robot_from_a_file_goes_on(tmp_path):
+    """Its args.json holds the body, but the script has no --robot."""
+    args = dataclasses.asdict(pretrain_pidm.Args(run_dir=str(tmp_path)))
+    record = args | {"config": {"body": {"digest": "d"}}, "versions": {}}
+    (tmp_path / "args.json").write_text(json.dumps(record))
+    resumed = records.resumed(pretrain_pidm.Args(resume=str(tmp_path)))
+    assert resumed.run_dir == str(tmp_path) and resumed.epochs == args["epochs"]
+
+
 def test_what_cannot_be_resumed_is_refused(whole, tmp_path, refused):
     def check(*words, folder=tmp_path / "run"):
         refused(ppo_finetune.main, ppo_finetune.Args(resume=str(folder)), *words)

@@ -275,7 +275,7 @@ def test_force_takes_the_old_results_away(tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["args.json", "mine.txt"]
 
 
-@pytest.mark.parametrize("name", records.RESULTS)
+@pytest.mark.parametrize("name", [*records.RESULTS, "meta.json"])
 def test_any_result_makes_a_folder_a_run(name, tmp_path):
     """Weights alone, say of somebody else's training, are not overwritten either."""
     (tmp_path / name).write_text("old")

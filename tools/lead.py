@@ -81,7 +81,7 @@ def picture(env, name, poses, times, tall):
     sharp = SHARPER * size[0], SHARPER * size[1]
     image = render.draw(scene(env.robot, poses, size, scale), poses.reshape(1, -1), sharp)[0]
     if image.size != sharp:
-        sys.exit("error: this picture needs OpenGL; Debian's libosmesa6 will do")
+        raise records.UserError("this picture needs OpenGL; on Linux libosmesa6 will do")
     image = image.resize(size, Image.LANCZOS)
     pen = ImageDraw.Draw(image)
     pen.text((20, size[1] - 14), f"{name}, {times[0]:.1f} s", INK, FONT, anchor="ls")

@@ -347,6 +347,8 @@ def main(args):
         if count != 1:
             fail(f"{name}: its text occurs {count} times in {file}")
     faults = [fault for fault in faults if args.only in " ".join(fault)]
+    if not faults:
+        fail(f"no fault has {args.only!r} in its name, file or tests; see --list")
     if args.list:
         print(
             *(f"{file}: {name} (tests/{tests}.py -k '{words}')" for name, _, _, file, tests, words in faults), sep="\n"

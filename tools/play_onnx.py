@@ -74,7 +74,8 @@ class Player:
         self.model = spec.compile()
         self.set_gains()
         self.data = mujoco.MjData(self.model)
-        self.decimation = round(self.facts["dt"] / self.model.opt.timestep)
+        self.decimation = max(round(self.facts["dt"] / self.model.opt.timestep), 1)
+        self.model.opt.timestep = self.facts["dt"] / self.decimation
         self.stand()
 
     def spec(self):
@@ -206,4 +207,7 @@ def main(args):
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args, description=__doc__))
+    try:
+        main(tyro.cli(Args, description=__doc__))
+    except KeyboardInterrupt:
+        sys.exit("interrupted")

@@ -39,8 +39,11 @@ class Args:
     robots: int = 8  # in the dump, at most
 
 
+DUMPED = ("qpos", "qvel", "ctrl", "mocap_pos", "mocap_quat")  # before a step; ctrl are the joint targets
+
+
 def trace(args, env, net, state):
-    """One rollout: qpos and qvel before each step, joint targets, and where a step failed; each (T, N, ...)."""
+    """One rollout: what is in DUMPED of each step, and where one failed; each (T, N, ...)."""
     k_roll, _ = jax.random.split(jax.random.fold_in(state.key, state.iteration))
     _, (roll, _) = ppo_finetune.rollout(args, env, net, state.params, state.env, k_roll)
 
@@ -48,7 +51,8 @@ def trace(args, env, net, state):
         after = jax.vmap(env.step)(before, action)
         sound = jnp.isfinite(after.reward) & jnp.isfinite(action).all(-1) & jnp.isfinite(after.final_obs).all(-1)
         physics, target = before.physics, jax.vmap(env.joint_targets)(before, action)
-        return after, (physics.qpos, physics.qvel, target, ~sound | after.metrics["diverged"])
+        course = physics.mocap_pos, physics.mocap_quat
+        return after, (physics.qpos, physics.qvel, target, *course, ~sound | after.metrics["diverged"])
 
     return jax.lax.scan(step, state.env, roll.action)[1]
 
@@ -67,13 +71,14 @@ def find(folder, iterations, robots):
     first = int(state.iteration)
     for _ in range(iterations):
         now = int(state.iteration)
-        qpos, qvel, ctrl, failed = map(np.asarray, jitted_trace(state))
+        *states, failed = map(np.asarray, jitted_trace(state))
         if failed.any():
             last = int(np.argmax(failed.any(1)))
             chosen = np.flatnonzero(failed[last])[:robots]
-            dump = {name: x[: last + 1, chosen] for name, x in (("qpos", qpos), ("qvel", qvel), ("ctrl", ctrl))}
+            dump = {name: x[: last + 1, chosen] for name, x in zip(DUMPED, states, strict=True)}
             path, file = Path(folder) / "nan.npz", io.BytesIO()
-            made = {"task": args.task, "robot": args.robot or "", "robust": args.robust, "set": np.array(args.set, str)}
+            robot = str(Path(args.robot).resolve()) if args.robot else ""
+            made = {"task": args.task, "robot": robot, "robust": args.robust, "set": np.array(args.set, str)}
             np.savez(file, **dump, **made, environment=chosen, iteration=now)
             records.replace_bytes(path, file.getvalue())
             count = f"{failed[last].sum()} of {args.num_envs}"
@@ -88,7 +93,7 @@ def repeat(path):
     """Repeat the last step of each dumped robot in plain MuJoCo."""
     try:
         with np.load(path, allow_pickle=False) as file:
-            names = ("qpos", "qvel", "ctrl", "environment", "task", "robot", "robust", "set")
+            names = (*DUMPED, "environment", "task", "robot", "robust", "set")
             dump = {name: file[name] for name in names}
         args = ppo_finetune.Args(task=str(dump["task"]), engine="c", set=tuple(dump["set"].tolist()))
         make = partial(envs.make, robust=bool(dump["robust"]), robot=str(dump["robot"]) or None)
@@ -99,7 +104,8 @@ def repeat(path):
         raise records.UserError(f"{path} is not a dump of tools/replay.py: {error}") from None
     for i, number in enumerate(dump["environment"]):
         data = mujoco.MjData(env.model)
-        data.qpos[:], data.qvel[:], data.ctrl[:] = (dump[name][-1, i] for name in ("qpos", "qvel", "ctrl"))
+        for name in DUMPED:
+            getattr(data, name)[:] = dump[name][-1, i]
         print(
             f"environment {number}: base at {np.round(data.qpos[:3], 2)} m, joint targets {np.round(data.ctrl, 2)} rad"
         )

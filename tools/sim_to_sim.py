@@ -408,7 +408,8 @@ def check_policy(path, facts, shapes):
 def phase_of(facts, command, seconds):
     """Sine and cosine (N, 2) of the gait's clock at a time since the start, 0 where it rests; command (N, 3)."""
     angle = 2 * np.pi * facts.get("gait_hz", 0.0) * seconds
-    return np.array([np.sin(angle), np.cos(angle)]) * (command.any(-1, keepdims=True) | facts.get("march", False))
+    moves = (np.hypot(command[:, :1], command[:, 1:2]) > 0.1) | (np.abs(command[:, 2:]) > 0.1)
+    return np.array([np.sin(angle), np.cos(angle)]) * (moves | facts.get("march", False))
 
 
 # --- Driving ---
