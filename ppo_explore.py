@@ -225,9 +225,9 @@ class Ensemble:
 
 
 def predict(member, params, norm, batch):
-    """Gaussian predictions of a_t by all members: mean and log variance, (M, B, A) each."""
+    """Gaussian prediction of a_t by one member: mean and log variance, (B, A) each."""
     inputs = flat_history(norm, batch.prop, batch.past), standardise(norm, "delta", batch.delta)
-    mean, log_var = jnp.split(jax.vmap(member.apply, (0, None, None))({"params": params}, *inputs), 2, -1)
+    mean, log_var = jnp.split(member.apply({"params": params}, *inputs), 2, -1)
     return mean, jnp.clip(log_var, -8.0, 4.0)
 
 
@@ -237,7 +237,7 @@ def disagreement(mean):
 
 
 def statistics(batch):
-    """Mean and std of every input over a batch, for `standardise`."""
+    """Mean and std of x_t, a_t and the change over a batch; past states and actions are scaled by them, too."""
     arrays = {"prop": batch.prop[..., -1, :], "action": batch.action, "delta": batch.delta}
     mean = {f"{name}_mean": x.mean(0) for name, x in arrays.items()}
     return mean | {f"{name}_std": x.std(0) + 1e-3 for name, x in arrays.items()}
@@ -245,12 +245,8 @@ def statistics(batch):
 
 def nll(member, params, norm, batch):
     """Gaussian negative log-likelihood without its constant: (M, B, ...) -> (), mean over a batch, sum over members."""
-
-    def one_member(params, batch):
-        mean, log_var = predict(member, jax.tree.map(lambda x: x[None], params), norm, batch)
-        return 0.5 * jnp.mean((batch.action - mean[0]) ** 2 * jnp.exp(-log_var[0]) + log_var[0])
-
-    return jax.vmap(one_member)(params, batch).sum()
+    mean, log_var = jax.vmap(partial(predict, member), (0, None, 0))(params, norm, batch)
+    return 0.5 * jnp.mean((batch.action - mean) ** 2 * jnp.exp(-log_var) + log_var, (1, 2)).sum()
 
 
 def bootstrap_indices(key, shape, filled):
@@ -281,7 +277,7 @@ def measure_novelty(member, ensemble, transitions):
     The ensemble must not have been trained on this rollout yet.
     """
     flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), transitions)
-    mean, _ = predict(member, ensemble.params, ensemble.norm, flat)
+    mean, _ = jax.vmap(partial(predict, member), (0, None, None))(ensemble.params, ensemble.norm, flat)
     novelty = disagreement(mean)
     # Fast mean: disagreement drops tenfold early. With a slow mean the reward would vanish, and robots learn to fall.
     scale = jnp.where(ensemble.scale > 0, 0.8 * ensemble.scale + 0.2 * novelty.mean(), novelty.mean())
@@ -344,7 +340,7 @@ def rollout(args, env, net, params, env_state, key):
         logp = log_prob(mean, log_std, action)
         roll = Rollout(inputs, action, mean, logp, value, after.reward, bootstrap, done)
 
-        # the transition, from noise-free readings
+        # the transition, from noise-free readings; after.history already shows the next episode where this one ended
         delta = after.final_history["prop"][:, -1] - before.history["prop"][:, -1]
         transition = Transitions(before.history["prop"], before.history["action"], delta, action)
         data = {"lin_vel": jax.vmap(env.motion)(before.physics).lin_vel, "rough": env.on_rough(before.physics)}
@@ -504,7 +500,7 @@ def iteration(args, env, net, opt, member, member_opt, state):
     else:
         losses = {}
 
-    # the ring buffer takes the rollout, then the ensemble trains on it
+    # the ring buffer takes the rollout, then the ensemble trains on draws from all of it
     size = args.num_steps * args.num_envs
     start = state.iteration % args.buffer_rollouts * size
     flat = jax.tree.map(lambda x: x.reshape(size, *x.shape[2:]), transitions)
@@ -529,7 +525,10 @@ def init_ensemble(args, member, opt, norm, batch, key):
 
 
 def init_state(args, env, net, opt, member, member_opt):
-    """New networks, an empty ring buffer, and N environments whose episode clocks start anywhere."""
+    """New networks, an empty ring buffer, and N environments whose episode clocks start anywhere.
+
+    Inputs of the ensemble have a mean of 0 and a std of 1 until `retrain` measures them.
+    """
     k_net, k_env, k_clock, k_members = jax.random.split(jax.random.key(args.seed), 4)
     clocks = jax.random.randint(k_clock, (args.num_envs,), 0, env.episode_steps)
     env_state = jax.jit(jax.vmap(env.reset))(jax.random.split(k_env, args.num_envs), clocks)

@@ -15,6 +15,7 @@ measures the shipped weights again, on the data of stage `collect`.
 import json
 import sys
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -205,7 +206,8 @@ def measure_novelty(env, dataset, path):
 
     @jax.jit
     def mean_disagreement(ensemble, batch):
-        return ppo_explore.disagreement(ppo_explore.predict(member, ensemble.params, ensemble.norm, batch)[0]).mean()
+        each = jax.vmap(partial(ppo_explore.predict, member), (0, None, None))
+        return ppo_explore.disagreement(each(ensemble.params, ensemble.norm, batch)[0]).mean()
 
     curves = {name: [] for name in probes}
     for i in range(200):

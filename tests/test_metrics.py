@@ -60,6 +60,8 @@ def test_a_row_is_the_mean_over_its_steps_and_over_its_episodes(likely):
     want |= {name: steps.metrics[name][done].mean() for name in ("episode_return", "episode_success")}
     want["fall_rate"] = steps.terminated.sum() / done.sum()
     assert row == pytest.approx(want, rel=1e-5)
+    counts = [row.pop(name) for name in ("iteration", "env_steps")]
+    assert [type(x) for x in counts] == [int, int], "beyond a million, too"
     assert all(type(x) is float and float(f"{x:.6g}") == x for x in row.values())
 
 

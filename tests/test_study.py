@@ -40,6 +40,7 @@ def runs(tmp_path, monkeypatch):
 
     monkeypatch.setattr(study.recording, "finetune", finetune)
     monkeypatch.setattr(study.recording, "evaluate", evaluate)
+    monkeypatch.setattr(study.Cell, "lacks", lambda cell: None)
     return calls
 
 
@@ -60,6 +61,27 @@ def test_a_study_resumes_what_was_interrupted(runs, capsys):
     assert len(runs) == 3, "nothing is run twice"
     study.show_status(study.planned(args))
     assert "2 of 2 runs" in capsys.readouterr().out
+
+
+def test_what_cannot_be_trained_yet_is_left_out(runs, monkeypatch, capsys):
+    """One line names the PIDM that is missing; the others are trained."""
+    monkeypatch.undo()
+    small, shipped, mlp = (study.Cell("batch", "anymal_climb_up", m, 0) for m in ("pidm_7k", "pidm_pretrained", "mlp"))
+    assert small.lacks() == "results/pidm/anymal_d/sizes/7000.msgpack" and not shipped.lacks() and not mlp.lacks()
+    study.main(study.Args(tasks=(small.task,), methods=(small.method,), seeds=(0,), list=True))
+    out, err = capsys.readouterr()
+    assert not out and err.startswith("left out: runs from results/pidm/anymal_d/sizes/7000.msgpack") and len(err) < 120
+
+
+def test_a_training_that_was_asked_to_stop_is_not_kept(runs, monkeypatch):
+    """It ends well, but without all of its steps."""
+    monkeypatch.setattr(study.recording, "finetune", lambda *words: True)
+    cell = study.Cell("batch", "go1_loco", "mlp", 2)
+    folder = study.ROOT / "runs" / cell.folder
+    folder.mkdir(parents=True)
+    (folder / "args.json").write_text('{"total_steps": 100}')
+    (folder / "metrics.csv").write_text("env_steps\n50\n")
+    assert not study.run(cell, 1.0) and not cell.done() and cell.share() == 0.5
 
 
 def test_no_run_starts_when_time_is_over(runs, capsys):
