@@ -470,7 +470,6 @@ def blocks(loaded):
         "": readme_table(study),
         "table 1": table_1(study),
         "all tasks": overall(study),
-        "along the way": along_the_way(study),
         "table 2": table_2(loaded),
         "controls": controls(loaded),
         "batch": batches_table(loaded),
@@ -486,7 +485,7 @@ def filled(text, lines):
 
 def details(loaded):
     """Text of results/study/README.md."""
-    parts = [DETAILS]
+    parts = [DETAILS, "## Table I, along the way", "", *along_the_way(pick(loaded)), ""]
     for scale, study in loaded.items():
         tables = *progress_table(study), "", *actions_table(study)
         parts += [f"## {scale}", "", *sizes_and_machines(study), "", *tables, ""]

@@ -431,8 +431,9 @@ def test_words_on_climbing_up_are_what_was_recorded():
 
 @pytest.mark.parametrize("name", ["README.md", "results/README.md", "docs/ppo_finetune.md"])
 def test_intervals_in_words_stand_in_a_table(name):
-    """The tables are those of README.md and results/README.md."""
-    pages = {page: (report.ROOT / page).read_text() for page in ("README.md", "results/README.md", name)}
+    """The tables are those of README.md and of the pages of results and runs."""
+    names = ("README.md", "results/README.md", "results/study/README.md", name)
+    pages = {page: (report.ROOT / page).read_text() for page in names}
     known = {pair for page in pages.values() for pair in re.findall(r"\[([+-][\d.]+), ([+-][\d.]+)\] \|", page)}
     words = re.sub(r"(intervals of .*?%) and ", r"\1, interval of ", " ".join(pages[name].split()))
     found = re.findall(r"intervals? of ([+-]?[\d.]+) to ([+-]?[\d.]+)%", words)
