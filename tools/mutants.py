@@ -80,7 +80,7 @@ FAULTS = {  # (file, tests, words for -k) -> faults: name, old text, new text
             "args.buffer_rollouts",
         ),
         ("the ring buffer stays at its start", "state.iteration % args.buffer_rollouts * size", "0 * state.iteration"),
-        ("likelihood without its log variance", "* jnp.exp(-log_var[0]) + log_var[0])", "* jnp.exp(-log_var[0]))"),
+        ("likelihood without its log variance", "exp(-log_var) + log_var, (1, 2))", "exp(-log_var), (1, 2))"),
         ("change of state over a reset", 'after.final_history["prop"][:, -1] -', 'after.history["prop"][:, -1] -'),
         ("starts of episodes a step late", '"first": opens[:-1]', '"first": opens[1:]'),
     ],
