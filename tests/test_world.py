@@ -292,7 +292,7 @@ def test_total_steps_extend_a_run(usual, tmp_path, refused):
     assert (out / "args.json").read_bytes() == before
     (out / "metrics.csv").unlink()  # state.msgpack has its rows, too
     script.main(script.Args(resume=str(out), total_steps=96))
-    assert rows_of(out)[:2] == rows_of(usual) and rows_of(out)[2]["env_steps"] == "96.0"
+    assert rows_of(out)[:2] == rows_of(usual) and rows_of(out)[2]["env_steps"] == "96"
     assert json.loads((out / "args.json").read_text()) == json.loads(before) | {"total_steps": 96}
 
 
