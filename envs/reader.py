@@ -92,7 +92,7 @@ def place_of(path, spec, name):
     """Position and quaternion of a body that hangs in the world, whichever way the file gives them."""
     twin = spec.copy()
     strip(path, twin, {mesh_name(mesh) for mesh in twin.meshes if not loadable(twin, mesh)})
-    drop(twin, "keys")
+    drop(twin, "keys", "pairs", "excludes")
     twin.compiler.fusestatic = False  # else it becomes part of the world
     body = compiled(path, twin).body(name)
     return [*body.pos, *body.quat]

@@ -193,10 +193,13 @@ def test_a_trunk_without_joint_becomes_free(write):
 
 
 def test_a_hanging_trunk_that_lacks_a_mesh_and_a_name_becomes_free(write):
+    """It touches the floor by contact pairs, as in files for MJX."""
     keys = f'<keyframe><key qpos="{"0 0.8 -1.6 " * 4}"/></keyframe>'
     mesh = '<geom type="mesh" mesh="part" contype="0" conaffinity="0" mass="0"/><geom name="trunk"'
     text = quadruped(base="", keys=keys).replace('<body name="trunk"', "<body").replace('<geom name="trunk"', mesh, 1)
     text = text.replace("<worldbody>", '<asset><mesh name="part" file="part.dae"/></asset><worldbody>')
+    text = text.replace('<geom type="plane"', '<geom name="floor" type="plane"')
+    text = text.replace("<actuator>", '<contact><pair geom1="FL_toe" geom2="floor"/></contact><actuator>')
     body = loader.load(write(text))
     assert body["base"] == "base" and len(body["joints"]) == 12 and len(body["feet"]) == 4
 
