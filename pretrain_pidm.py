@@ -392,7 +392,7 @@ def checkpoint_meta(args, env, data, sizes, row):
 
 
 def commanded_change(env, x, action):
-    """Joint target minus joint angle, a_t - q_t [rad]; its size is the paper's action magnitude (Fig. 4b, c)."""
+    """a_t - q_t [rad], joint target minus angle; its size is the paper's magnitude. x (..., X), action (..., A)."""
     # joint_pos is relative to the default pose, and so is the target
     return np.float32(env.robot.action_scale) * action - x[..., env.prop_slices()["joint_pos"]]
 

@@ -54,11 +54,12 @@ class Task(FootClocks):
     velocity: jax.Array  # (3,) low-passed forward, sideways [m/s] and turning [rad/s]
 
 
-ORDER = ("lin_vel", "ang_vel", "gravity", "command", "joint_pos", "joint_vel", "action")  # of the observation
+SEEN = BODY | {"command": ("planar", (2.0, 2.0, 0.25))}
+ORDER = ("lin_vel", "ang_vel", "gravity", "command", "joint_pos", "joint_vel", "action")  # of what is seen
 
 
 class Locomotion(Env):
-    OBS = {name: BODY.get(name, ("planar", (2.0, 2.0, 0.25))) for name in ORDER}
+    OBS = {name: SEEN[name] for name in ORDER}
     SHOWCASE_FIELDS = {"fixed_velocity": (0.8, 0.0), "spawn_yaw": 0.0, "spawn_xy": 0.0}
 
     def __init__(self, config, engine="auto"):

@@ -137,7 +137,8 @@ def run(cell, seconds):
     log = ROOT / "runs" / cell.folder / "log.txt"
     log.parent.mkdir(parents=True, exist_ok=True)
     with log.open("a") as file:
-        if not recording.finetune(cell.words(), file, seconds) or cell.share() < 1:  # one that was stopped ends well
+        ended = recording.finetune(cell.words(), file, seconds)
+        if not ended or (cell.share() or 0) < 1:  # a training that was asked to stop ends well, too
             return False
         recording.evaluate(cell.folder, ROOT / "results" / cell.folder, KEPT, file)
     return True

@@ -265,26 +265,21 @@ def test_missing_meshes_give_way(write):
     np.testing.assert_allclose(model.geom_size[shape] ** 2 * 2 / 3 * 0.5, 1e-3, rtol=1e-5)  # inertia of a cube
 
 
-def test_a_mesh_that_is_there_becomes_a_fitted_shape(write, tmp_path):
+@pytest.mark.parametrize(
+    ("asked", "fitted"), [("mesh", mujoco.mjtGeom.mjGEOM_CAPSULE), ("sphere", mujoco.mjtGeom.mjGEOM_SPHERE)]
+)
+def test_a_mesh_that_is_there_becomes_a_fitted_shape(asked, fitted, write, tmp_path):
+    """A bar of 0.2 m becomes a capsule, or what the file asks for."""
     corners = np.array(np.meshgrid([-0.1, 0.1], [-0.02, 0.02], [-0.02, 0.02])).reshape(3, -1).T
     (tmp_path / "bar.obj").write_text("".join("v {} {} {}\n".format(*c) for c in corners) + CUBE)
-    text = quadruped().replace('<geom name="trunk" type="box" size="0.2 0.08 0.05"/>', '<geom type="mesh" mesh="bar"/>')
+    text = quadruped().replace('type="box" size="0.2 0.08 0.05"', f'type="{asked}" mesh="bar"')
     body = loader.load(write(text.replace("<worldbody>", '<asset><mesh file="bar.obj"/></asset><worldbody>')))
     model = mujoco.MjModel.from_xml_string(body["mjcf"])
     (shape,) = [g for g in range(model.ngeom) if model.geom_bodyid[g] == 1 and model.geom_contype[g]]
-    assert model.geom_type[shape] == mujoco.mjtGeom.mjGEOM_CAPSULE
-    np.testing.assert_allclose(model.geom_size[shape, :2], [0.02, 0.08], rtol=1e-4)
+    assert model.geom_type[shape] == fitted
+    if asked == "mesh":
+        np.testing.assert_allclose(model.geom_size[shape, :2], [0.02, 0.08], rtol=1e-4)
     assert any("collision meshes of trunk" in note for note in body["notes"])
-
-
-def test_a_fit_that_the_file_asks_for_is_kept(write, tmp_path):
-    corners = np.array(np.meshgrid([-0.1, 0.1], [-0.02, 0.02], [-0.02, 0.02])).reshape(3, -1).T
-    (tmp_path / "bar.obj").write_text("".join("v {} {} {}\n".format(*c) for c in corners) + CUBE)
-    text = quadruped().replace('type="box" size="0.2 0.08 0.05"', 'type="sphere" mesh="bar"')
-    body = loader.load(write(text.replace("<worldbody>", '<asset><mesh file="bar.obj"/></asset><worldbody>')))
-    model = mujoco.MjModel.from_xml_string(body["mjcf"])
-    (shape,) = [g for g in range(model.ngeom) if model.geom_bodyid[g] == 1 and model.geom_contype[g]]
-    assert model.geom_type[shape] == mujoco.mjtGeom.mjGEOM_SPHERE
 
 
 @pytest.mark.parametrize("kind", ["obj", "dae"])

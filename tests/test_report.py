@@ -390,7 +390,7 @@ def test_words_on_the_mlp_are_what_was_recorded():
         above += ends[0] > ends[1] * (1 + 1e-9)
         sooner += there[0] < there[1]
         gains.append(100 * (ends[1] / ends[2] - 1))
-    assert f"here it ends above it in {above} and is sooner in {sooner}" in text
+    assert f"here the pretrained PIDM ends above it in {above} and is sooner in {sooner}" in text
     gains.remove(max(gains))
     assert f"({np.mean(gains):.1f}% without climbing up)" in text
 
