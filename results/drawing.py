@@ -66,7 +66,7 @@ def batch(runs):
 def title(task, runs):
     """Title of a task, which says so if its runs were made before the task was changed."""
     earlier = any(run.get("earlier") for arm in runs.values() for run in arm)
-    return TASKS[task] + " (earlier task)" * earlier
+    return TASKS.get(task, task) + " (earlier task)" * earlier
 
 
 def draw_task(ax, heading, runs, methods, extra=None):

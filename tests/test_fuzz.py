@@ -20,7 +20,7 @@ import ppo_finetune
 import pretrain_pidm
 from envs.base import PROP
 from experiment import records
-from results import report
+from results import tables
 
 MUTATIONS = 1_000  # of each format
 JUNK = (None, True, -1, 0, 1e308, 2**63, "", "x" * 99, [], {}, [[]], {"a": {}}, "../../etc", float("nan"))
@@ -177,9 +177,8 @@ def test_collections(collection, tmp_path):
     assert taken < MUTATIONS
 
 
-def test_run_folders(tmp_path, capsys, monkeypatch):
+def test_run_folders(tmp_path, capsys):
     """The report names a damaged run and leaves it out."""
-    monkeypatch.setattr(report, "ROOT", tmp_path)
     rng, folder, left_out = random.Random(4), tmp_path / "seed0", 0
     folder.mkdir()
     record = {"num_envs": 2, "num_steps": 5, "total_steps": 40, "lr": 1.0, "num_epochs": 5, "mirror_coef": 0.1}
@@ -188,12 +187,12 @@ def test_run_folders(tmp_path, capsys, monkeypatch):
     texts["metrics.csv"] = "iteration,env_steps,episode_return\n" + "".join(f"{i},{10 * i},1.5\n" for i in range(1, 5))
     for name, text in texts.items():
         (folder / name).write_text(text)
-    assert report.load_run(folder)
+    assert tables.load_run(folder)
     for i in range(MUTATIONS):
         name = rng.choice(list(texts))
         blob = texts[name].encode()
         spoilt = json.dumps(spoil(rng, json.loads(blob))).encode() if name.endswith("json") and i % 2 else None
         (folder / name).write_bytes(spoilt or damage(rng, blob))
-        left_out += report.load_run(folder) is None
+        left_out += tables.load_run(folder) is None
         (folder / name).write_bytes(blob)
     assert left_out == capsys.readouterr().err.count("left out: ") > MUTATIONS / 4

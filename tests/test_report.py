@@ -12,7 +12,7 @@ import pytest
 from scipy import stats
 
 from experiment import records
-from results import drawing, measures, pidm, report, tasks
+from results import drawing, measures, pidm, report, tables, tasks
 from tools import bench
 
 
@@ -75,8 +75,8 @@ def test_what_was_not_run_or_not_reached_is_said():
     runs = {"pidm_random": flat(10.0), "mlp": flat(10.0, 1.0)}
     assert str(measures.compare("t", runs, "mlp", "to 90%")) == "≥ +450.0"  # iteration 1, and 10 for never
     assert str(measures.compare("t", runs, "mlp", "final")) == "-45.0"
-    assert report.shown(measures.compare("t", runs, "pidm_pretrained", "final")) == "not run"
-    assert report.shown(measures.compare("t", {}, "mlp", "final")) == "not run"
+    assert tables.shown(measures.compare("t", runs, "pidm_pretrained", "final")) == "not run"
+    assert tables.shown(measures.compare("t", {}, "mlp", "final")) == "not run"
     runs = {"pidm_random": flat(1.0, 9.0), "mlp": flat(10.0)}
     assert str(measures.compare("t", runs, "mlp", "to 90%")) == "≤ -81.8"  # 1 against 1 and 10
     assert str(measures.compare("t", runs | {"mlp": flat(2.0)}, "mlp", "to 90%")) == "~ +81.8"
@@ -176,7 +176,7 @@ def test_means_over_tasks():
     }
     assert str(measures.mean_over_seeds(study, "mlp", "final")) == "-10.0"
     assert measures.mean_over_tasks(study, "mlp", "final").value == pytest.approx(870 / 3)
-    every, several = (line.split(" | ") for line in report.table_1(study)[-2:])
+    every, several = (line.split(" | ") for line in tables.table_1(study)[-2:])
     assert every[3].startswith("+290.0 [") and every[4] == "-1.1"  # the paper: +0.6, -0.2 and -3.7
     assert several[3:5] == ["-10.0", "+0.2"] and several[5:7] == ["not run", ""]
 
@@ -217,7 +217,7 @@ def test_improvement_pairs_runs_by_seed():
     arm = [curve([3.0] * 10, 2), curve([1.0] * 10, 0), curve([5.0] * 10, 1), curve([99.0] * 10, 7)]
     runs = {"pidm_random": flat(2.0, 5.0, 1.0), "mlp": arm}
     assert sorted(measures.better("final", arm, runs["pidm_random"])) == [0.0, 0.5, 1.0]
-    assert report.wins(runs, "mlp", "final") == "1.5 of 3"
+    assert tables.wins(runs, "mlp", "final") == "1.5 of 3"
     strangers = {"pidm_random": [curve([1.0] * 10, 8)], "mlp": arm}  # no seed in common: no pair, and no part in a mean
     assert measures.improvement({"go1_loco": runs, "g1_loco": strangers}, "mlp", "final").value == 50.0
     assert measures.improvement({"g1_loco": strangers}, "mlp", "final") is None
@@ -231,14 +231,14 @@ def test_controls_compare_the_same_seeds():
     runs = {"pidm_random": flat(10.0, 10.0, 40.0), "pidm_shuffled": flat(11.0, 11.0)}
     arms = measures.same_seeds(runs, "pidm_shuffled", "pidm_random")
     assert [len(arm) for arm in arms.values()] == [2, 2]
-    line = report.controls({"cpu": {"go1_loco": runs}})[-1].split(" | ")
+    line = tables.controls({"cpu": {"go1_loco": runs}})[-1].split(" | ")
     assert line[1:6] == ["256 x 24", "PIDM shuffled", "PIDM random", "0, 1", "+10.0"]
     assert measures.same_seeds(runs, "pidm_shuffled", "mlp") == {}
     for method, moves in {"pidm_shuffled": 3.0, "pidm_random": 2.0}.items():
         for run in runs[method]:
             run["columns"] = {"update/actor/backbone": np.full(10, moves)}
     runs["pidm_random"][2]["columns"]["update/actor/backbone"] += 99.0  # the seed without a partner
-    assert report.controls({"cpu": {"go1_loco": runs}})[-1].endswith("| +50 |")
+    assert tables.controls({"cpu": {"go1_loco": runs}})[-1].endswith("| +50 |")
 
 
 # --- Tables ---
@@ -246,14 +246,14 @@ def test_controls_compare_the_same_seeds():
 
 def test_spread_is_the_std_of_a_sample():
     """9 and 11: the std is the root of 2 with ddof 1; with ddof 0 it is 1."""
-    assert report.spread([12.5]) == "12.5"
-    assert report.spread([9.0, 11.0]) == "10 ± 1.4"
+    assert tables.spread([12.5]) == "12.5"
+    assert tables.spread([9.0, 11.0]) == "10 ± 1.4"
 
 
 def test_counts_say_how_many_got_there():
-    assert report.counts([100.0, 300.0]) == "200"
-    assert report.counts([100.0, np.nan, 300.0]) == "200 (2 of 3)"
-    assert report.counts([np.nan]) == "not reached"
+    assert tables.counts([100.0, 300.0]) == "200"
+    assert tables.counts([100.0, np.nan, 300.0]) == "200 (2 of 3)"
+    assert tables.counts([np.nan]) == "not reached"
 
 
 def test_updates_are_of_the_first_iterations_and_also_per_step_size():
@@ -264,7 +264,7 @@ def test_updates_are_of_the_first_iterations_and_also_per_step_size():
         columns = {f"update/actor/{module}": scale * np.array([1.0, 3.0, 99.0 / scale]) for module in drawing.MODULES}
         return {"iteration": iteration, "columns": columns | {"lr": step * np.array([1.0, 1.0, 7.0 / step])}}
 
-    table = report.updates_table({"go1_loco": {"pidm_random": [run(1.0, 4.0)], "pidm_pretrained": [run(0.5, 1.0)]}})
+    table = tables.updates_table({"go1_loco": {"pidm_random": [run(1.0, 4.0)], "pidm_pretrained": [run(0.5, 1.0)]}})
     assert table[-1] == "| Go1 locomotion | 1 | -50 | -50 | -50 | -50 | -75 | +100 |"
 
 
@@ -273,14 +273,14 @@ def test_all_machines_of_a_task_are_named():
     for method, device in {"mlp": "NVIDIA H200", "pidm_random": "cpu", "pidm_pretrained": "cpu"}.items():
         settings = {"num_envs": 2, "num_steps": 5, "total_steps": 3e6}
         runs[method] = [{"settings": settings, "versions": {"device": device, "machine": "m", "jax": "1"}}]
-    (line,) = report.sizes_and_machines({"go1_loco": runs})
+    (line,) = tables.sizes_and_machines({"go1_loco": runs})
     assert line == "- Go1 locomotion: `go1_loco`, 2 x 5, 3.0 M steps, NVIDIA H200, m, jax 1; cpu, m, jax 1"
 
 
 def test_rows_of_earlier_tasks_are_marked():
     """Jumping was run before its task was changed; climbing up before and after."""
     titles = [
-        drawing.title(task, report.load_task(report.ROOT / f"results/study/{scale}/{task}"))
+        drawing.title(task, tables.load_task(report.ROOT / f"results/study/{scale}/{task}"))
         for scale, task in (("cpu", "anymal_jump"), ("cpu", "anymal_climb_up"), ("batch", "anymal_climb_up"))
     ]
     assert titles == ["Jump (earlier task)", "Climb up (earlier task)", "Climb up"]
@@ -290,10 +290,10 @@ def test_rows_of_earlier_tasks_are_marked():
 
 
 def test_the_paper_s_means_are_those_it_prints():
-    assert np.isclose(np.mean(report.PAPER["final"]["mlp"]), 1.0, atol=0.05)
-    assert np.isclose(np.mean(report.PAPER["final"]["pidm_pretrained"]), 4.3, atol=0.05)
-    assert np.isclose(np.mean(report.PAPER["to 90%"]["mlp"]), -9.5, atol=0.05)
-    assert np.isclose(np.mean(report.PAPER["to 90%"]["pidm_pretrained"]), -36.2, atol=0.1)
+    assert np.isclose(np.mean(tables.PAPER["final"]["mlp"]), 1.0, atol=0.05)
+    assert np.isclose(np.mean(tables.PAPER["final"]["pidm_pretrained"]), 4.3, atol=0.05)
+    assert np.isclose(np.mean(tables.PAPER["to 90%"]["mlp"]), -9.5, atol=0.05)
+    assert np.isclose(np.mean(tables.PAPER["to 90%"]["pidm_pretrained"]), -36.2, atol=0.1)
 
 
 def test_pages_are_what_the_runs_give():
@@ -356,9 +356,9 @@ def test_words_of_the_page_are_what_was_recorded():
     mlp = [100 * (own / base - 1) for own, base in zip(mlp, random_ends[:9], strict=True)]
     assert f"{np.mean(mlp):.1f}" == f"{np.mean(ends):.1f}" and "but so does the MLP" in text
     assert f"ends {np.mean(ends):.1f}% higher" in text and f"needs {-np.mean(there):.1f}% fewer iterations" in text
-    gains = np.array(report.PAPER["to 90%"]["pidm_pretrained"]) < there
+    gains = np.array(tables.PAPER["to 90%"]["pidm_pretrained"]) < there
     assert gains.sum() == 9 and "all nine figures are worse" in text
-    order = stats.spearmanr(there, report.PAPER["to 90%"]["pidm_pretrained"]).statistic
+    order = stats.spearmanr(there, tables.PAPER["to 90%"]["pidm_pretrained"]).statistic
     assert f"(rank correlation {order:.1f})" in text
     last = {m: recorded("anymal_loco", m, "cpu")[:, -4:].mean(1) for m in ("mlp", "pidm_random", "pidm_pretrained")}
     assert last["pidm_pretrained"].min() > max(last["mlp"].max(), last["pidm_random"].max())
@@ -635,7 +635,7 @@ def test_other_pages_are_what_their_records_give(monkeypatch):
 
 def test_report_writes_the_same_bytes_twice(tmp_path, monkeypatch):
     monkeypatch.setattr(report, "STUDY", tmp_path)
-    study = {"go1_loco": report.load_task(report.ROOT / "results/study/cpu/go1_loco")}
+    study = {"go1_loco": tables.load_task(report.ROOT / "results/study/cpu/go1_loco")}
     images = []
     for _ in range(2):
         report.draw_all({"cpu": study})
@@ -648,7 +648,7 @@ def test_figures_of_parkour_and_updates_are_drawn(tmp_path, monkeypatch):
     """A single seed, three methods; and that a figure goes once the runs no longer allow it."""
     monkeypatch.setattr(report, "STUDY", tmp_path)
     names = ("anymal_jump", "anymal_pedipulation")
-    study = {name: report.load_task(report.ROOT / f"results/study/cpu/{name}") for name in names}
+    study = {name: tables.load_task(report.ROOT / f"results/study/cpu/{name}") for name in names}
 
     def drawn(study):
         report.draw_all({"cpu": study})
@@ -686,7 +686,7 @@ def test_what_pretraining_brings_is_drawn_over_the_batch(tmp_path):
     loaded = {"cpu": arms(256, 9.0, 10.0), "256": arms(256, 10.0, 10.0), "batch": arms(4096, 12.0, 13.0)}
     loaded["batch"]["anymal_loco"] = {"pidm_random": flat(1.0)}  # not both PIDMs
     assert drawing.draw_batch(loaded, tmp_path / "batch.png") and (tmp_path / "batch.png").stat().st_size > 5000
-    _, _, *rows = [re.split(r" ?\| ?", line) for line in report.batches_table(loaded)]
+    _, _, *rows = [re.split(r" ?\| ?", line) for line in tables.batches_table(loaded)]
     expected = [
         ("256 x 24", "pytorch_unscaled", "-9.5 "),
         ("256 x 24", "pytorch", "-4.8 "),
@@ -698,15 +698,14 @@ def test_what_pretraining_brings_is_drawn_over_the_batch(tmp_path):
     assert [runs["pidm_pretrained"][0]["indicator"][0] for runs in titled.values()] == [9.0, 10.0, 12.0]
     one_batch = {"cpu": loaded["cpu"], "256": loaded["256"]}
     assert not drawing.draw_batch(one_batch, tmp_path / "none.png") and not (tmp_path / "none.png").exists()
-    assert report.batches_table({"batch": loaded["batch"]}) == ["One batch so far."]
+    assert tables.batches_table({"batch": loaded["batch"]}) == ["One batch so far."]
     assert not drawing.curves_by_scale({"batch": loaded["batch"]})
     assert not drawing.draw_critics({"g1_loco": loaded["batch"]["go1_loco"]}, tmp_path / "none.png")
 
 
 @pytest.fixture
-def study(tmp_path, monkeypatch):
+def study(tmp_path):
     """Two methods of one seed each."""
-    monkeypatch.setattr(report, "ROOT", tmp_path)
     args = {"num_envs": 2, "num_steps": 5, "total_steps": 40, "lr": 1.0, "num_epochs": 5, "mirror_coef": 0.1}
     args |= {"config": {}, "seed": 0, "versions": {"machine": "m"}}
     for method in ("mlp", "pidm_random"):
@@ -723,18 +722,18 @@ def study(tmp_path, monkeypatch):
 
 def test_bad_runs_are_left_out_with_a_warning(study, capsys):
     folder, args = study
-    assert set(report.load_task(folder)) == {"mlp", "pidm_random"} and not capsys.readouterr().err
+    assert set(tables.load_task(folder)) == {"mlp", "pidm_random"} and not capsys.readouterr().err
     target = folder / "pidm_random/seed0"
     (target / "args.json").write_text(json.dumps(args | {"lr": 2.0}))
-    assert set(report.load_task(folder)) == {"mlp"}
+    assert set(tables.load_task(folder)) == {"mlp"}
     assert "other settings" in capsys.readouterr().err
     (target / "args.json").write_text(json.dumps(args | {"total_steps": 50}))
-    assert set(report.load_task(folder)) == {"mlp"}
+    assert set(tables.load_task(folder)) == {"mlp"}
     assert "stopped before its last step" in capsys.readouterr().err
     (target / "args.json").write_text(json.dumps(args))
     text = (target / "metrics.csv").read_text()
     (target / "metrics.csv").write_text(text[:-5] + "\n")
-    assert set(report.load_task(folder)) == {"mlp"}
+    assert set(tables.load_task(folder)) == {"mlp"}
     assert "left out" in capsys.readouterr().err
 
 
@@ -747,42 +746,48 @@ def test_success_by_level_is_a_mean_over_runs_of_the_same_levels(study, capsys, 
         (target / "args.json").write_text(json.dumps(args | {"seed": seed}))
         result["level 1"]["episode_success"] = last
         (target / "eval.json").write_text(json.dumps(result))
-    runs = report.load_task(folder)
+    runs = tables.load_task(folder)
     assert list(runs) == ["mlp"] and "other settings" in capsys.readouterr().err  # PIDM random was run on no level
     assert drawing.success_of(runs["mlp"]).tolist() == [100.0, 25.0]
     assert drawing.draw_success({"anymal_jump": runs}, tmp_path / "success.png")
 
 
 def test_without_a_baseline_there_is_no_level_to_reach(study):
-    runs = report.load_task(study[0])
-    assert "no PIDM random" not in "".join(report.progress_table({"go1_loco": runs}))
-    alone = report.progress_table({"go1_loco": {"mlp": runs["mlp"]}})[-1]
+    runs = tables.load_task(study[0])
+    assert "no PIDM random" not in "".join(tables.progress_table({"go1_loco": runs}))
+    alone = tables.progress_table({"go1_loco": {"mlp": runs["mlp"]}})[-1]
     assert alone.count("no PIDM random") == 2 and "not reached" not in alone
 
 
-def test_highest_level_reached_stands_where_it_was_recorded(study):
-    """Older rows have no progress_reached: their cell is empty, and so is the whole column if none has any."""
+def test_indicator_of_parkour_is_the_level_reached(study):
+    """Older rows have levels solved alone, which are their indicator; newer ones have these in a column."""
     folder, _ = study
-    path = folder / "mlp/seed0/metrics.csv"
-    assert "reached" not in report.progress_table({"anymal_jump": report.load_task(folder)})[0]
-    names, *rows = path.read_text().splitlines()
-    path.write_text("\n".join([f"{names},progress_reached", *(f"{row},0.25" for row in rows)]) + "\n")
-    table = report.progress_table({"anymal_jump": report.load_task(folder)})
-    assert "progress reached at the end" in table[0] and "| 0.25 |" in table[2] and "|  |" in table[3]
+    for method, columns, values in (
+        ("mlp", "progress,progress_reached", "0.25,0.5"),
+        ("pidm_random", "progress", "0.125"),
+    ):
+        path = folder / method / "seed0/metrics.csv"
+        names, *rows = path.read_text().splitlines()
+        path.write_text("\n".join([f"{names},{columns}", *(f"{row},{values}" for row in rows)]) + "\n")
+    runs = tables.load_task(folder)
+    assert {method: set(arm[0]["indicator"]) for method, arm in runs.items()} == {"mlp": {0.5}, "pidm_random": {0.125}}
+    table = tables.progress_table({"anymal_jump": runs})
+    assert "solved at the end" in table[0] and "| 0.25 |" in table[2] and "|  |" in table[3]
+    assert "solved" not in tables.progress_table({"anymal_jump": {"pidm_random": runs["pidm_random"]}})[0]
 
 
 def test_sizes_are_those_that_were_pretrained_on(tmp_path, monkeypatch):
-    monkeypatch.setattr(report, "ROOT", tmp_path)
+    monkeypatch.setattr(tables, "ROOT", tmp_path)
     folder = tmp_path / "results/pidm/anymal_d"
     (folder / "sizes").mkdir(parents=True)
     for stem, samples, error in (("sizes/7000_", 7000, 0.9), ("sizes/70000_", 70000, 0.6), ("", 920000, 0.3)):
         (folder / f"{stem}validation.json").write_text(json.dumps({"error_rad": error, "normalized_error": 2 * error}))
         (folder / f"{stem}metrics.csv").write_text(f"iteration,samples\n1.0,{samples}.0\n2.0,{2 * samples}.0\n")
-    assert report.sizes_of("anymal_d") == {7000: 0.9, 70000: 0.6, 920000: 0.3}
+    assert tables.sizes_of("anymal_d") == {7000: 0.9, 70000: 0.6, 920000: 0.3}
     run = {"pidm_random": flat(10.0, 11.0), "pidm_7k": flat(9.0, 9.5), "pidm_pretrained": flat(12.0, 13.0)}
     study = {"anymal_climb_up": run, "anymal_climb_down": run}
-    assert drawing.draw_sizes(study, tmp_path / "sizes.png", report.sizes_of("anymal_d"))
-    assert drawing.draw_sizes({}, tmp_path / "errors.png", report.sizes_of("anymal_d"))
+    assert drawing.draw_sizes(study, tmp_path / "sizes.png", tables.sizes_of("anymal_d"))
+    assert drawing.draw_sizes({}, tmp_path / "errors.png", tables.sizes_of("anymal_d"))
     both, errors = (matplotlib.image.imread(tmp_path / f"{name}.png").shape[1] for name in ("sizes", "errors"))
     assert both == 2 * errors  # no empty panel where no task was run with them
     lines = report.sizes(study, report.titles("sizes"), tuple(study))
@@ -800,6 +805,42 @@ def test_what_has_not_run_is_named():
     assert names[0] in line and names[1] in line
     *table, blank, last = report.table_2(loaded)
     assert "+20.0" in "".join(table) and not blank and names[0] not in last and names[1] in last
+
+
+def test_gait_is_a_mean_over_the_seeds_of_which_it_was_measured(study):
+    folder, args = study
+    for seed, falls in ((0, 4.0), (1, 8.0), (2, None)):
+        target = folder / f"mlp/seed{seed}"
+        shutil.copytree(folder / "pidm_random/seed0", target, dirs_exist_ok=True)
+        (target / "args.json").write_text(json.dumps(args | {"seed": seed}))
+        gait = dict.fromkeys(tables.GAIT, 0.5) | {"episodes": 20.0, "push of 1.0 m/s/episodes": 5.0, "falls": falls}
+        (target / "eval.json").write_text(json.dumps({"task": {}} | ({} if falls is None else {"gait": gait})))
+    *_, row = tables.gait_table({"go1_loco": tables.load_task(folder)})
+    assert row == "| Go1 locomotion | MLP | 2 | 0.3 | 0.1 | 0.5 | 0.5 | 0.5 | 0.5 | 0.5 |"
+
+
+def test_runs_of_a_task_are_compared(study, capsys):
+    """Of any task, before they were evaluated: the baseline ends at 8, PIDM pretrained at 10 with twice the mean."""
+    folder, _ = study
+    shutil.copytree(folder / "pidm_random/seed0", folder / "pidm_pretrained/seed0")
+    for path in folder.glob("*/*/eval.json"):
+        path.unlink()
+    path = folder / "pidm_pretrained/seed0/metrics.csv"
+    path.write_text(path.read_text().replace(",2.0\n", ",10.0\n").replace(",8.0\n", ",10.0\n"))
+    report.main(report.Args(compare=str(folder)))
+    out = capsys.readouterr().out
+    assert "| PIDM pretrained | +25.0 | +50.0 | -50.0 | -75.0 |" in out and folder.name in out
+    assert (folder / "curves.png").stat().st_size > 10_000
+    with pytest.raises(records.UserError, match="no complete runs"):
+        report.main(report.Args(compare=str(folder / "mlp")))
+
+
+def test_a_task_of_one_s_own_leaves_the_paper_s_numbers_where_they_are():
+    runs = {"pidm_random": flat(10.0), "pidm_pretrained": flat(12.0), "mlp": flat(9.0)}
+    study = {"go1_stand": runs, "go1_loco": runs}
+    rows = tables.table_1(study, tuple(study))
+    assert "+0.6" not in rows[2] and "| go1_stand |" in rows[2] and "+0.6" in rows[3]
+    assert "| +20.0 | +3.6 |" in rows[4], "the mean of the paper is of its own tasks"
 
 
 def test_live_draws_until_the_run_is_over(tmp_path, capsys):

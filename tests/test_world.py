@@ -26,7 +26,7 @@ import ppo_finetune as script
 import pretrain_pidm
 from envs import engine, gl, render
 from experiment import dataset, devices, figures, records, run
-from results import report
+from results import tables
 
 ROOT = Path(__file__).resolve().parent.parent
 SMOKE = script.Args(preset="smoke")
@@ -452,10 +452,10 @@ def test_windows_line_ends_are_read(name, usual, tmp_path, monkeypatch):
     out = tmp_path / "run"
     shutil.copytree(usual, out)
     (out / "eval.json").write_text('{"task": {"falls": 0.0}}')
-    want = report.load_run(out)["columns"]
+    want = tables.load_run(out)["columns"]
     (out / name).write_bytes((out / name).read_bytes().replace(b"\n", b"\r\n"))
     assert b"\r\n" in (out / name).read_bytes()
-    found = report.load_run(out)["columns"]
+    found = tables.load_run(out)["columns"]
     jax.tree.map(np.testing.assert_array_equal, found, want)
 
 
