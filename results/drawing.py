@@ -39,12 +39,15 @@ def panels(rows, columns, width=4.6, height=3.3, **options):
 
 
 def band(ax, x, curves, label, look):
-    """Draw the mean of curves (K, R) over x (R,), shaded by one standard deviation if there are several."""
+    """Draw the mean of curves (K, R) over x (R,), with all of them if there are up to three, else their spread."""
     curves = np.asarray(curves)
-    ax.plot(x, curves.mean(0), label=label, **look)
-    if len(curves) > 1:
-        mean, std = curves.mean(0), curves.std(0, ddof=1)
+    mean = curves.mean(0)
+    ax.plot(x, mean, label=label, **look)
+    if len(curves) > 3:
+        std = curves.std(0, ddof=1)
         ax.fill_between(x, mean - std, mean + std, color=look["color"], alpha=0.18, linewidth=0)
+    elif len(curves) > 1:
+        ax.plot(x, curves.T, color=look["color"], lw=0.6, alpha=0.6)
 
 
 def legend_below(fig, axes, note, columns=4):
@@ -54,7 +57,7 @@ def legend_below(fig, axes, note, columns=4):
     fig.legend(entries.values(), entries.keys(), title=note, **place)
 
 
-SHADE = "shaded: mean ± one standard deviation over seeds (none where there is one)"
+SHADE = "thick: means over seeds; thin: up to three seeds; shaded: one standard deviation of more"
 
 
 def batch(runs):
@@ -87,7 +90,8 @@ def draw_task(ax, heading, runs, methods, extra=None):
         ax.plot(*extra[1:], color="black", label=extra[0])
     parkour = "progress" in first["columns"]
     seeds_of = measures.seeds(runs, [method for method in methods if method in runs])
-    ax.set(title=f"{heading} (n = {seeds_of})", xlabel="PPO iteration", ylim=(0, None))
+    ax.set(title=f"{heading}, {batch(runs)} (n = {seeds_of})", xlabel="PPO iteration")
+    ax.set_ylim(bottom=0 if parkour else None)
     ax.set_ylabel("curriculum progress" if parkour else "episode return")
     per_iteration = first["columns"]["env_steps"][-1] / first["iteration"][-1] / 1e6
     above = ax.secondary_xaxis("top", functions=(lambda x: x * per_iteration, lambda x: x / per_iteration))
@@ -231,7 +235,7 @@ def by_scale(loaded, task):
 def curves_by_scale(loaded):
     """Title -> runs of the walking quadrupeds that were run at several scales."""
     return {
-        f"{TASKS[task]}, {batch(runs)}{', unscaled' * is_unscaled(scale)}": runs
+        TASKS[task] + ", unscaled" * is_unscaled(scale): runs
         for task in WALKING
         for scale, runs in by_scale(loaded, task).items()
         if len(by_scale(loaded, task)) > 1
@@ -245,7 +249,7 @@ def is_unscaled(scale):
 
 CRITIC = {
     "lr": "step size",
-    "critic_grad_norm": "gradient\nof the critic",
+    "critic_grad_norm": "norm of the\ncritic's gradient",
     "explained_variance": "explained\nvariance",
     "episode_return": "return",
 }
@@ -274,7 +278,7 @@ def draw_critics(study, path):
             ax.grid(alpha=0.3)
             ax.set_yscale("log" if name in ("lr", "critic_grad_norm") else "linear")
     axes[list(CRITIC).index("explained_variance"), 0].set_ylim(-0.5, 1.0)
-    legend_below(fig, axes.ravel(), "a line for each run", columns=3)
+    legend_below(fig, axes.ravel(), "a line for each run; explained variance is cut at -0.5", columns=3)
     figures.save(fig, path, dpi=80)
     return True
 
@@ -283,40 +287,38 @@ BATCH_PANELS = ("final", "area", "to 90%")
 
 
 def draw_points(axes, task, scales, colour, marker, side):
-    """A point for each scale, filled ones joined by a line. Returns the numbers of environments."""
-    joined, counts = [], []
+    """A point for each scale, with its number of seeds. Returns the numbers of environments."""
+    counts = []
     for scale, runs in scales.items():
         counts.append(runs["pidm_random"][0]["settings"]["num_envs"])
         x, unscaled = side * counts[-1], is_unscaled(scale)
-        found = [measures.compare(task, runs, "pidm_pretrained", name) for name in BATCH_PANELS]
         look = {"color": colour, "mfc": "none" if unscaled else colour}
-        for ax, one in zip(axes, found, strict=True):
+        for ax, name in zip(axes, BATCH_PANELS, strict=True):
+            one = measures.compare(task, runs, "pidm_pretrained", name)
             ax.plot(x, one.value, marker, label=TASKS[task] + ", unscaled first actions" * unscaled, **look)
+            number = f" {len(runs['pidm_pretrained'])}"
+            ax.text(x, one.value, number, color=colour, fontsize=7, va="bottom", ha="left" if side > 1 else "right")
             if one.interval:
                 ax.vlines(x, *one.interval, color=colour, lw=1, ls=":" if unscaled else "-")
-        joined += [] if unscaled else [(x, [one.value for one in found])]
-    if joined:
-        x, values = zip(*joined, strict=True)
-        for ax, y in zip(axes, np.transpose(values), strict=True):
-            ax.plot(x, y, color=colour, lw=1)
     return counts
 
 
 def draw_batch(loaded, path):
     """What pretraining brings over the number of environments (scale -> task -> runs), on the walking quadrupeds."""
     fig, (axes,) = panels(1, len(BATCH_PANELS), 3.6)
-    looks = zip(WALKING, ("C0", "C1"), "os", (0.95, 1.05), strict=True)
+    looks = zip(WALKING, ("#7F3C8D", "#0B8A6F"), "os", (0.95, 1.05), strict=True)
     ticks = sorted({count for task, *look in looks for count in draw_points(axes, task, by_scale(loaded, task), *look)})
     if len(ticks) < 2:
         figures.pyplot().close(fig)
         return False
     for ax, name in zip(axes, BATCH_PANELS, strict=True):
         ax.axhline(0.0, color="0.6", lw=1)
-        ax.set(xlabel="environments", title=measures.MEASURES[name].title, xscale="log")
+        less = " (fewer are better)" if measures.MEASURES[name].share else ""
+        ax.set(xlabel="environments", title=measures.MEASURES[name].title + less, xscale="log")
         ax.set_xticks(ticks, ticks)
         ax.minorticks_off()
         ax.grid(alpha=0.3)
     axes[0].set_ylabel("pretrained against random [%]")
-    legend_below(fig, axes, "vertical lines: 95% intervals over seeds (none where there is one)")
+    legend_below(fig, axes, "numbers: seeds; lines: 95% intervals over them")
     figures.save(fig, path, dpi=80)
     return True

@@ -11,7 +11,6 @@ words around the marks are written by hand. The indicator of a task is the paper
 parkour the highest level reached. measures.py has the measures and their statistics.
 """
 
-import csv
 import json
 import os
 import re
@@ -181,10 +180,9 @@ def beside(folder):
     try:
         args = json.loads((folder / "args.json").read_text())
         task, config = args["task"], task_of(args["config"])
-        with (folder / "metrics.csv").open() as file:
-            rows = list(csv.DictReader(file))
+        rows = records.read_rows(folder / "metrics.csv")
         name = next(name for name in tables.INDICATORS if name in rows[0])
-        points = [(float(row["iteration"]), float(row[name])) for row in rows]
+        points = [(row["iteration"], row[name]) for row in rows]
     except (OSError, ValueError, KeyError, IndexError, TypeError, StopIteration) as error:
         raise records.UserError(f"{folder} is not a run of ppo_finetune.py: {error}") from None
     known = [study[task] for study in load_study().values() if task in study]
@@ -211,10 +209,9 @@ def live(folder, seconds=10.0):
     while True:
         try:
             total = json.loads((folder / "args.json").read_text())["total_steps"]
-            with (folder / "metrics.csv").open() as file:
-                rows = [{name: float(value) for name, value in row.items()} for row in csv.DictReader(file)]
+            rows = records.read_rows(folder / "metrics.csv")
             steps = rows[-1]["env_steps"]
-        except (OSError, ValueError, KeyError, IndexError) as error:
+        except (OSError, ValueError, KeyError, IndexError, TypeError) as error:
             raise records.UserError(f"{folder} has no rows of ppo_explore.py or ppo_finetune.py: {error!r}") from None
         if len(rows) > drawn:
             figures.plot_training(rows, folder / "curve.png")
@@ -247,7 +244,11 @@ def write_all(check):
 
 
 def main(args):
-    for folder, act in ((args.compare, compare), (args.beside, beside), (args.live, live)):
+    if args.compare:
+        return compare(Path(args.compare))
+    for folder, act in ((args.beside, beside), (args.live, live)):
+        if folder and (several := sorted(Path(folder).glob("seed*/args.json"))):
+            raise records.UserError(f"{folder} holds several seeds; give one, such as {several[0].parent}")
         if folder:
             return act(Path(folder))
     return write_all(args.check)
