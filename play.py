@@ -239,6 +239,9 @@ def export_onnx(args):
         "torque_limit": env.model.actuator_forcerange[:, 1].tolist(),  # [N m] bounds the kp part; damping comes on top
         "history": env.config.history,
         "prop": list(env.prop_layout),
+        "joint_range": env.model.jnt_range[1:].tolist(),  # [rad]; joint_target is not clipped to it
+        "command_ranges": env.COMMAND_RANGES,  # as trained
+        "robust": meta["args"].get("robust", False),
         **({"mjcf": env.config.body["mjcf"]} if env.config.body else {}),  # of a robot from a file
         # of the input `phase`
         **({name: getattr(env.config, name) for name in ("gait_hz", "march")} if "phase" in shapes else {}),

@@ -33,7 +33,7 @@ class Args:
     """A field left at None is filled in from the preset or the robot. The merged set is printed and saved."""
 
     # --- Experiment ---
-    robot: str = "go1"  # a name in envs.EXPLORE, or an MJCF or URDF file
+    robot: str = "go1"  # a name in envs.EXPLORE, an MJCF, URDF or .toml file, or a run's args.json
     preset: Literal["smoke", "cpu", "gpu"] = "cpu"  # scale: 4, 256 or 4096 environments
     seed: int = 0  # the only source of randomness
     engine: str = "auto"  # physics: c (CPU threads), mjx (accelerators), warp (NVIDIA)
@@ -84,7 +84,7 @@ PRESETS = {
     "cpu": {"num_envs": 256, "num_steps": 24, "total_steps": 1_500_000, "log_every": 5},
     "gpu": {"num_envs": 4096, "num_steps": 24, "total_steps": 7_600_000, "log_every": 2},
 }
-SHOWN = ("disagreement", "ensemble_error", "fall_rate", "kl", "action_std")  # as it runs
+SHOWN = ("disagreement", "ensemble_error", "fall_rate", "kl", "action_std")  # columns printed
 
 
 def num_held_out(args):
@@ -221,7 +221,7 @@ class Ensemble:
     params: dict  # leaves (M, ...)
     opt_state: optax.OptState
     norm: dict  # <prop|action|delta>_<mean|std>, of the ring buffer
-    scale: jax.Array  # () running mean of the disagreement, in action units squared
+    scale: jax.Array  # () running mean of the disagreement [action units squared]; 0 before the first rollout
 
 
 def predict(member, params, norm, batch):
@@ -247,6 +247,14 @@ def nll(member, params, norm, batch):
     """Gaussian negative log-likelihood without its constant: (M, B, ...) -> (), mean over a batch, sum over members."""
     mean, log_var = jax.vmap(partial(predict, member), (0, None, 0))(params, norm, batch)
     return 0.5 * jnp.mean((batch.action - mean) ** 2 * jnp.exp(-log_var) + log_var, (1, 2)).sum()
+
+
+def init_ensemble(args, member, opt, norm, batch, key):
+    """New members, each from a key of its own; `batch` gives the shapes."""
+    one = jax.tree.map(lambda x: x[0], batch)
+    inputs = flat_history(norm, one.prop, one.past), one.delta
+    params = jax.vmap(lambda k: member.init(k, *inputs)["params"])(jax.random.split(key, args.members))
+    return Ensemble(params, opt.init(params), norm, jnp.zeros(()))
 
 
 def bootstrap_indices(key, shape, filled):
@@ -382,7 +390,7 @@ def mirror_loss(env, net, params, inputs, mean, key):
     """
     inputs, mean = jax.tree.map(lambda x: x[::4], (inputs, mean))
     which = jax.random.randint(key, (), 0, len(env.mirrors))
-    table = jax.tree.map(lambda *tables: jnp.stack(tables)[which], *env.mirrors.values())
+    table = jax.tree.map(lambda *tables: jnp.stack(tables)[which], *env.mirrors.values())  # perm, sign
     mirrored = {name: x[..., table[name][0]] * table[name][1] for name, x in inputs.items()}
     target = jax.lax.stop_gradient(mean)[:, table["action"][0]] * table["action"][1]
     return jnp.mean((net.apply(params, mirrored, method=net.mean) - target) ** 2)
@@ -491,9 +499,9 @@ def iteration(args, env, net, opt, member, member_opt, state):
     k_roll, k_update, k_retrain = jax.random.split(jax.random.fold_in(jax.random.key(args.seed), state.iteration), 3)
     env_state, roll, transitions, data, report = rollout(args, env, net, state.params, state.env, k_roll)
     novelty, ensemble, novelty_report = measure_novelty(member, state.ensemble, transitions)
-    reward = roll.reward + args.disagreement_coef * env.dt * novelty / ensemble.scale
 
     if args.policy == "explore":
+        reward = roll.reward + args.disagreement_coef * env.dt * novelty / ensemble.scale
         last_value = net.apply(state.params, net.inputs(env_state.obs, env_state.history), method=net.value)
         advantage, ret = gae(args, reward + roll.bootstrap, roll.done, roll.value, last_value)
         state, losses = update(args, env, net, opt, state, (roll, advantage, ret), k_update)
@@ -508,20 +516,12 @@ def iteration(args, env, net, opt, member, member_opt, state):
     filled = jnp.minimum(state.iteration + 1, args.buffer_rollouts) * size
     ensemble, loss = retrain(args, member, member_opt, ensemble, buffer, filled, k_retrain)
 
-    opens = jnp.concatenate([state.first[None], roll.done])
-    data |= {"x": transitions.prop[:, :, -1], "action": transitions.action, "first": opens[:-1]}
+    first = jnp.concatenate([state.first[None], roll.done])  # (T+1, N): the step after a done opens an episode
+    data |= {"x": transitions.prop[:, :, -1], "action": transitions.action, "first": first[:-1]}
     report = metrics.over_time(report) | losses | novelty_report
     report |= {"ensemble_nll": loss, "action_std": jnp.exp(state.params["params"]["log_std"]).mean()}
-    state = state.replace(env=env_state, first=opens[-1], ensemble=ensemble, buffer=buffer)
+    state = state.replace(env=env_state, first=first[-1], ensemble=ensemble, buffer=buffer)
     return state.replace(iteration=state.iteration + 1), (report, data)
-
-
-def init_ensemble(args, member, opt, norm, batch, key):
-    """New members, each from a key of its own; `batch` gives the shapes."""
-    one = jax.tree.map(lambda x: x[0], batch)
-    inputs = flat_history(norm, one.prop, one.past), one.delta
-    params = jax.vmap(lambda k: member.init(k, *inputs)["params"])(jax.random.split(key, args.members))
-    return Ensemble(params, opt.init(params), norm, jnp.zeros(()))
 
 
 def init_state(args, env, net, opt, member, member_opt):
@@ -529,13 +529,14 @@ def init_state(args, env, net, opt, member, member_opt):
 
     Inputs of the ensemble have a mean of 0 and a std of 1 until `retrain` measures them.
     """
-    k_net, k_env, k_clock, k_members = jax.random.split(jax.random.key(args.seed), 4)
+    key = jax.random.fold_in(jax.random.key(args.seed), 2**31 - 1)  # iterations fold in their numbers
+    k_net, k_env, k_clock, k_members = jax.random.split(key, 4)
     clocks = jax.random.randint(k_clock, (args.num_envs,), 0, env.episode_steps)
     env_state = jax.jit(jax.vmap(env.reset))(jax.random.split(k_env, args.num_envs), clocks)
     params = net.init(k_net, net.inputs(env_state.obs, env_state.history))
-    shapes = (env.config.history + 1, env.prop_dim), (env.config.history, env.action_dim), (env.prop_dim,)
-    rows = args.num_envs * args.num_steps * args.buffer_rollouts
-    buffer = Transitions(*(jnp.zeros((rows, *shape)) for shape in (*shapes, (env.action_dim,))))
+    rows, history = args.num_envs * args.num_steps * args.buffer_rollouts, env.config.history
+    prop, past = jnp.zeros((rows, history + 1, env.prop_dim)), jnp.zeros((rows, history, env.action_dim))
+    buffer = Transitions(prop, past, delta=jnp.zeros((rows, env.prop_dim)), action=jnp.zeros((rows, env.action_dim)))
     norm = {name: jnp.ones_like(x) if name.endswith("std") else x for name, x in statistics(buffer).items()}
     ensemble = init_ensemble(args, member, member_opt, norm, buffer, k_members)
     lr, first, zero = jnp.float32(min(args.lr, args.max_lr)), jnp.ones(args.num_envs, bool), jnp.zeros((), jnp.int32)
@@ -560,7 +561,7 @@ def explore(args):
     shardings = devices.of_state(state, axis=0)
     state = devices.place(state, shardings)
 
-    @partial(jax.jit, donate_argnums=0, out_shardings=(shardings, devices.same()))
+    @partial(jax.jit, donate_argnums=0, out_shardings=(shardings, devices.replicated()))
     def collect_chunk(state):
         return jax.lax.scan(lambda s, _: iteration(args, state=s, **parts), state, None, args.log_every)
 

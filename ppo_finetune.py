@@ -85,7 +85,7 @@ PRESETS = {
     "cpu": {"num_envs": 256, "num_steps": 24, "log_every": 10},
     "gpu": {"num_envs": 4096, "num_steps": 24, "log_every": 10},
 }
-SHOWN = ("episode_return", "fall_rate", "lin_vel_error", "foot_error", "progress", "kl", "action_std")  # as it runs
+SHOWN = ("episode_return", "fall_rate", "lin_vel_error", "foot_error", "progress", "kl", "action_std")  # printed
 
 
 def merge(args, ppo):
@@ -97,7 +97,7 @@ def merge(args, ppo):
     network = args.network or ("pidm" if args.pretrained else "mlp")
     loaded = {"both": "pretrained", "none": "random"}.get(args.load_into, args.load_into)
     method = network if args.policy or network == "mlp" else f"pidm_{loaded if args.pretrained else 'random'}"
-    seed = f"/seed{args.seed}" * (args.num_seeds == 1)
+    seed = f"/seed{args.seed}" if args.num_seeds == 1 else ""  # several add their own
     values = {"network": network, "run_dir": f"runs/{envs.label(args.task, args.robot)}/{method}{seed}"}
     values |= {"hidden": ppo["hidden"], "intention": ppo.get("intention"), "lr": 1e-4 if args.policy else 1e-3}
     values |= {"init_std": ppo["init_std"], "entropy_coef": ppo["entropy"], "desired_kl": ppo.get("desired_kl", 0.01)}
@@ -149,7 +149,7 @@ def flat_history(norm, prop, action):
 
 
 # >>> copy: sizes (owner: pretrain_pidm.py)
-SIZES = {  # layer widths of the PIDM's parts, without the output layer; our choice: the paper counts the layers alone
+SIZES = {  # layer widths, our choice; goal: delta or intention encoder; head: decoder or synthesizer, without its last
     "anymal_d": {"history": (128, 64), "goal": (64, 32), "backbone": (192, 192, 192, 64), "head": (64,)},
     "go1": {"history": (128, 64), "goal": (64, 32), "backbone": (192, 192, 192, 64), "head": (64,)},
     "g1": {"history": (224, 96), "goal": (96, 32), "backbone": (224, 224, 224, 64), "head": (64,)},
@@ -286,18 +286,16 @@ def warm_start(args, env, params, key):
     --load-into names what to load. Without --pretrained the shipped PIDM's normalisation is used: the two differ in
     weights alone. UserError if the file is missing or of another robot, action scale, dt, x or K.
     """
-    if args.resume:  # the saved state has both
-        return params
     path = Path(args.pretrained or SHIPPED / f"{env.robot.name}.msgpack")
     core = {name: params["params"]["actor"][name] for name in ("history_encoder", "backbone")}
     pidm = records.load_pidm(path, env, {"params": core, "normalizer": params["normalizer"]})
     core = jax.tree.map(jnp.asarray, pidm["params"])
     if args.load_into == "shuffled":
-        core = shuffle_weights(core, jax.random.fold_in(key, 1))
+        core = shuffle_weights(core, key)
     if args.load_into == "history_encoder":
         core = {"history_encoder": core["history_encoder"]}
     branches = {"actor": ["actor"], "critic": ["critic"], "none": []}.get(args.load_into, ["actor", "critic"])
-    loaded = {branch: params["params"][branch] | core for branch in branches if args.pretrained}
+    loaded = {branch: params["params"][branch] | core for branch in (branches if args.pretrained else [])}
     for branch in loaded:
         print(f"{branch}: loaded {' and '.join(core)} from {path}")
     return {"params": params["params"] | loaded, "normalizer": jax.tree.map(jnp.asarray, pidm["normalizer"])}
@@ -388,7 +386,7 @@ def mirror_loss(env, net, params, inputs, mean, key):
     """
     inputs, mean = jax.tree.map(lambda x: x[::4], (inputs, mean))
     which = jax.random.randint(key, (), 0, len(env.mirrors))
-    table = jax.tree.map(lambda *tables: jnp.stack(tables)[which], *env.mirrors.values())
+    table = jax.tree.map(lambda *tables: jnp.stack(tables)[which], *env.mirrors.values())  # perm, sign
     mirrored = {name: x[..., table[name][0]] * table[name][1] for name, x in inputs.items()}
     target = jax.lax.stop_gradient(mean)[:, table["action"][0]] * table["action"][1]
     return jnp.mean((net.apply(params, mirrored, method=net.mean) - target) ** 2)
@@ -494,7 +492,7 @@ def iteration(args, env, net, opt, state):
     k_roll, k_update = jax.random.split(jax.random.fold_in(state.key, state.iteration))
     env_state, (roll, report) = rollout(args, env, net, state.params, state.env, k_roll)
     last_value = net.apply(state.params, net.inputs(env_state.obs, env_state.history), method=net.value)
-    # a time limit is no end of the task: what would have followed it counts with its reward
+    # a time limit is no end of the task: the value of what would follow is added to the reward
     advantage, ret = gae(args, roll.reward + roll.bootstrap, roll.done, roll.value, last_value)
     new, losses = update(args, env, net, opt, state, (roll, advantage, ret), k_update)
     report = metrics.over_time(report) | losses
@@ -506,15 +504,16 @@ def iteration(args, env, net, opt, state):
 
 def init_state(args, env, net, opt):
     """New or loaded networks, and N environments at random episode clocks, so that time-outs spread out."""
-    key = jax.random.key(args.seed)
-    k_net, k_env, k_clock = jax.random.split(key, 3)
+    key, k_net, k_env, k_clock, k_load = jax.random.split(jax.random.key(args.seed), 5)
     clocks = jax.random.randint(k_clock, (args.num_envs,), 0, env.episode_steps)
     env_state = jax.jit(jax.vmap(env.reset))(jax.random.split(k_env, args.num_envs), clocks)
     params = net.init(k_net, net.inputs(env_state.obs, env_state.history))
     if args.weight_init == "pytorch":  # orthogonal last layers are small already, pytorch_unscaled keeps PyTorch's
         shrink_first_actions(params)
-    params = warm_start(args, env, params, key) if args.network == "pidm" and not args.policy else params
-    params = records.load_policy(args.policy, params, env) if args.policy and not args.resume else params
+    if args.policy and not args.resume:  # a saved state replaces the weights
+        params = records.load_networks(args.policy, params, env)
+    elif args.network == "pidm" and not args.resume:
+        params = warm_start(args, env, params, k_load)
     return TrainState(params, opt.init(params), jnp.float32(min(args.lr, args.max_lr)), env_state, key, jnp.int32(0))
 
 
@@ -527,7 +526,7 @@ def make_chunk(args, env, net, opt, states):
     def all_seeds(states):  # one seed fills a CPU, so there they run one after the other
         return jax.lax.map(one_seed, states) if jax.default_backend() == "cpu" else jax.vmap(one_seed)(states)
 
-    return jax.jit(all_seeds, out_shardings=(devices.of_state(states, axis=1), devices.same()))
+    return jax.jit(all_seeds, out_shardings=(devices.of_state(states, axis=1), devices.replicated()))
 
 
 def train(args):
@@ -542,7 +541,8 @@ def train(args):
     train_chunk = run.compile(make_chunk(args, env, net, opt, states), states)
     with run:
         while not run.done:
-            before, (states, report) = states, train_chunk(states)
+            before = states
+            states, report = train_chunk(states)
             run.log(states.iteration[0], unstack(report))  # metrics.csv, progress
             run.save_policies(before, states)  # and state.msgpack; weights that are not finite end the run here
     run.finish(states)

@@ -38,7 +38,7 @@ class Args:
     data: str = "runs/explore/go1/seed0"  # folder of a finished ppo_explore.py
     preset: Literal["smoke", "cpu", "gpu"] = "cpu"  # scale
     seed: int = 0  # the only source of randomness
-    eval: str | None = None  # validate this pidm.msgpack on held-out data of --data, not train; figures go beside it
+    eval: str | None = None  # instead of training, validate this pidm.msgpack on held-out data; figures go beside it
     # --- Records ---
     run_dir: str | None = None  # None: runs/pidm/<robot>/seed<seed>
     force: bool = False  # overwrite the run in that folder
@@ -62,7 +62,7 @@ PRESETS = {
     "cpu": {"epochs": 20, "batch": 1024},
     "gpu": {"epochs": 100, "batch": 8192},
 }
-SHOWN = ("train_error", "error", "normalized_error", "last_action_error")  # as it runs
+SHOWN = ("train_error", "error", "normalized_error", "last_action_error")  # columns printed
 
 
 def merge(args, robot):
@@ -138,7 +138,7 @@ class PIDM(nn.Module):
 
 
 # >>> copy: sizes (owner: pretrain_pidm.py)
-SIZES = {  # layer widths of the PIDM's parts, without the output layer; our choice: the paper counts the layers alone
+SIZES = {  # layer widths, our choice; goal: delta or intention encoder; head: decoder or synthesizer, without its last
     "anymal_d": {"history": (128, 64), "goal": (64, 32), "backbone": (192, 192, 192, 64), "head": (64,)},
     "go1": {"history": (128, 64), "goal": (64, 32), "backbone": (192, 192, 192, 64), "head": (64,)},
     "g1": {"history": (224, 96), "goal": (96, 32), "backbone": (224, 224, 224, 64), "head": (64,)},
@@ -289,7 +289,7 @@ def decay(args, val_errors):
 def make_step(args, env, net, opt):
     """Return an Adam step, compiled: variables, opt_state, batch (to augment), key, lr -> the first two, loss ()."""
 
-    @partial(jax.jit, out_shardings=devices.same())
+    @partial(jax.jit, out_shardings=devices.replicated())
     def step(variables, opt_state, batch, key, lr):
         batch = augment(args, env, key, batch)
         loss, grads = jax.value_and_grad(lambda p: l1_loss(net, variables | {"params": p}, batch))(variables["params"])
@@ -320,7 +320,7 @@ def run_epoch(args, data, index, step, state, val_errors):
 
 def init_variables(args, env, net, windows):
     """Random params, and a normalizer measured on these windows."""
-    k_init, k_norm = jax.random.split(jax.random.key(args.seed))
+    k_init, k_norm = jax.random.split(jax.random.fold_in(jax.random.key(args.seed), 2**31 - 1))  # epochs: 0, 1, ...
     history = (env.config.history + 1) * env.prop_dim + env.config.history * env.action_dim
     params = net.init(k_init, jnp.zeros(history), jnp.zeros(env.prop_dim))
     return params | {"normalizer": make_normalizer(args, env, k_norm, windows)}
@@ -344,7 +344,7 @@ def pretrain(args):
 
     run = Run(args, env.config, args.epochs, SHOWN, over="samples")
     (state,), (folder,) = run.start(init), run.folders
-    state = devices.place(state, jax.tree.map(lambda _: devices.same(), state))
+    state = devices.place(state, jax.tree.map(lambda _: devices.replicated(), state))
     step, predictor = make_step(args, env, net, opt), make_predictor(args, env, net)
     val_errors = [row["error"] for row in run.rows[0]]
     with run:
@@ -355,7 +355,7 @@ def pretrain(args):
             row = metrics.rounded(row | errors(env, data, predict_all(predictor, env, state[0], data, validated)))
             run.add([row])
             val_errors.append(row["error"])
-            if not np.isfinite(loss):
+            if not np.isfinite(loss + row["error"]):
                 raise records.UserError(f"the error is not finite after epoch {epoch}; lower --lr")
             if folder and row["error"] == min(val_errors):
                 records.save(folder / "pidm.msgpack", state[0], checkpoint_meta(args, env, data, net.sizes, row))
@@ -422,7 +422,7 @@ def errors(env, data, outcome):
     action = outcome["action"]
     wrong = np.abs(outcome["predicted"] - action)
     error, error_rad = wrong.mean(), (wrong * np.float32(env.robot.action_scale)).mean()
-    sample = data.windows(data.train[:: max(len(data.train) // 20_000, 1)])["action"]
+    sample = data.action[np.divmod(data.train[:: max(len(data.train) // 20_000, 1)], data.x.shape[1])]
     return {
         "error": error,  # [action units]
         "error_rad": error_rad,
@@ -449,8 +449,8 @@ def validate(predictor, env, variables, data, folder):
 
 def run_validation(args):
     """Validate the PIDM of --eval on the collection --data. UserError if the two do not fit."""
-    if args.run_dir or args.resume:
-        raise records.UserError("--eval writes beside its PIDM; leave out --run-dir and --resume")
+    if args.run_dir or args.resume or args.distributed:
+        raise records.UserError("--eval writes beside its PIDM; leave out --run-dir, --resume and --distributed")
     if not (path := Path(args.eval)).is_file():
         raise records.UserError(f"--eval {path}: there is no such file")
     data, env = open_data(args)

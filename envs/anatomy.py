@@ -30,13 +30,14 @@ def balls(shape):
     return pos + local @ turn.reshape(3, 3).T, radius
 
 
-def posed(spec, pose):
-    """Model and data of a spec with the trunk upright in the origin and these joint angles."""
+def posed(spec, pose=None):
+    """Model and data of a spec with the trunk upright in the origin, at these joint angles or those of the file."""
     model = spec.compile()
-    data = mujoco.MjData(model)
-    data.qpos[:] = [0, 0, 0, 1, 0, 0, 0, *pose]
+    data = mujoco.MjData(model)  # at qpos0
+    data.qpos[:7] = 0, 0, 0, 1, 0, 0, 0
+    if pose is not None:
+        data.qpos[7:] = pose
     mujoco.mj_kinematics(model, data)
-    mujoco.mj_comPos(model, data)
     return model, data
 
 
@@ -182,10 +183,7 @@ def gait(places):
 
 def mirrors_of(spec, body, notes):
     """Tables of each symmetry that is found: joints and feet with the image of each, and the signs of joints."""
-    model, data = posed(spec, np.zeros(len(body["joints"])))
-    data.qpos[7:] = model.qpos0[7:]
-    mujoco.mj_kinematics(model, data)
-    mujoco.mj_comPos(model, data)
+    model, data = posed(spec)
     mirrors, errors = {}, {}
     for name, reflection in REFLECTIONS.items():
         images, error = body_images(model, data, reflection)
@@ -253,9 +251,7 @@ def joint_images(model, data, reflection, images, body):
 def average(spec, body, notes):
     """Average masses, inertias and gains over each symmetry, so that mirrored motion is exact."""
     for name, reflection in REFLECTIONS.items():
-        model, data = posed(spec, np.zeros(len(body["joints"])))
-        data.qpos[7:] = model.qpos0[7:]
-        mujoco.mj_kinematics(model, data)
+        model, data = posed(spec)
         images, _ = body_images(model, data, reflection)
         table = images and joint_images(model, data, reflection, images, body)
         if not table:

@@ -227,7 +227,11 @@ class Env:
     def failed(self, task, motion):
         """True () if the episode ends in failure: a forbidden body touches the ground, or the trunk tilts too far."""
         force = jnp.linalg.norm(motion.sensors[self.end_sensors], axis=-1)
-        return jnp.any(force > self.touch) | (-motion.gravity[2] < jnp.cos(jnp.deg2rad(self.config.max_tilt)))
+        return jnp.any(force > self.touch) | self.tilted(motion)
+
+    def tilted(self, motion):
+        """True () if the trunk is more than `max_tilt` from level."""
+        return -motion.gravity[2] < jnp.cos(jnp.deg2rad(self.config.max_tilt))
 
     def after_rewards(self, key, task, motion, clock):
         """Update the task state for the next step: draw commands that are due."""
@@ -291,13 +295,16 @@ class Env:
         """Advance by one control step and, if the episode ends there, start the next one. action (A,)."""
         key, k_noise, k_task, k_push, k_curriculum, k_reset = jax.random.split(state.key, 6)
         physics = self.engine.step(state.physics, self.joint_targets(state, action))
-        healthy = jnp.all(jnp.abs(physics.qpos) < DIVERGED) & jnp.all(jnp.abs(physics.qvel) < DIVERGED)  # NaN fails
+        bounded = jnp.concatenate([physics.qpos[2:], physics.qvel])  # a long walk may lead anywhere
+        healthy = jnp.all(jnp.abs(bounded) < DIVERGED) & jnp.all(jnp.isfinite(physics.qpos))
         physics = select(healthy, physics, self.standing(state.physics))  # later numbers stay finite
 
         # rewards and the end of the episode, from the true motion
         motion = self.motion(physics)
         task = self.before_rewards(state.task, motion)
         terms = self.rewards(task, motion, action, state.action, state.clock)
+        if unknown := self.config.weights.keys() - terms.keys():
+            raise ValueError(f"no reward term {', '.join(unknown)}; this task has {', '.join(terms)}")
         terms = {
             name: jnp.asarray(weight * terms[name] * self.dt, jnp.float32)
             for name, weight in self.config.weights.items()

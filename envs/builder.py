@@ -16,7 +16,6 @@ PLURAL = {
     GEOM.mjGEOM_CYLINDER: "cylinders",
     GEOM.mjGEOM_ELLIPSOID: "ellipsoids",
 }
-SOLIDS = tuple(PLURAL)
 
 
 # --- shapes ---
@@ -75,12 +74,12 @@ def shapes_of(model, root, lost, notes):
         name, owner = model.geom(g).name, model.body(model.geom_bodyid[g]).name
         solid = bool(model.geom_contype[g] or model.geom_conaffinity[g])
         kind, half = int(model.geom_type[g]), model.geom_size[g]
-        if kind not in SOLIDS:
+        if kind not in PLURAL:
             continue
         shape = {"body": int(model.geom_bodyid[g]), "name": name, "solid": solid, "rgba": model.geom_rgba[g]}
         shape |= {"type": kind, "size": half, "pos": model.geom_pos[g], "quat": model.geom_quat[g]}
         shapes.append(shape)
-        if new := simpler(shape, kind in SOLIDS[3:]) if solid else {}:
+        if new := simpler(shape, kind in (GEOM.mjGEOM_CYLINDER, GEOM.mjGEOM_ELLIPSOID)) if solid else {}:
             shape |= new
             changed.setdefault(f"{PLURAL[kind]} became {PLURAL[new['type']]}", {})[name or owner] = None
     for owner in lost:

@@ -67,7 +67,7 @@ POSITIVE = (
     *("push_seconds", "link_mass", "motor_strength"),
 )
 AT_LEAST_0 = (
-    *("noise", "scan_noise", "scan_shift", "spawn_xy", "spawn_yaw", "spawn_spread", "spawn_velocity", "friction"),
+    *("noise", "scan_noise", "scan_shift", "spawn_xy", "spawn_yaw", "spawn_velocity", "friction"),
     *("joint_friction", "push_velocity", "perturb_force", "yaw_rate", "tracking_seconds", "gait_hz", "swing_height"),
     *("base_force", "foot_force", "all_feet_force", "velocity_limit", "random_seconds", "hasty", "air_time_threshold"),
 )
@@ -107,7 +107,8 @@ def replace_checked(config, overrides):
             raise ValueError(f"{name} cannot be set: {FIXED[name]}")
         if name not in kinds:
             choices = [other for other in kinds if name.startswith("weights.") == other.startswith("weights.")]
-            raise ValueError(f"unknown option {name!r}; choose one of {', '.join(sorted(choices))}")
+            hint = " (a weight has to stand in the task's config first)" if name.startswith("weights.") else ""
+            raise ValueError(f"unknown option {name!r}; choose one of {', '.join(sorted(choices))}{hint}")
         try:
             values[name] = (parse if isinstance(value, str) else convert)(value, kinds[name])
         except ValueError:

@@ -110,7 +110,9 @@ class Engine:
         """Indices into `Physics.sensors`, (len(names), width). ValueError for a name that the MJCF lacks."""
         for name in names:
             if mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_SENSOR, name) < 0:
-                raise ValueError(f"the robot's MJCF has no sensor {name!r}")
+                known = [self.model.sensor(i).name for i in range(self.model.nsensor)]
+                known = [other for other in known if other.endswith(f"_{name.rpartition('_')[2]}")]
+                raise ValueError(f"the robot's MJCF has no sensor {name!r}; it has {', '.join(known)}")
         found = [self.model.sensor(name) for name in names]
         return np.array([np.arange(s.adr[0], s.adr[0] + s.dim[0]) for s in found]) if names else np.zeros((0, 3), int)
 
@@ -358,8 +360,12 @@ def best_engine():
     """Name of the default: c on a CPU, warp on one GPU where it is installed, else mjx."""
     if jax.default_backend() == "cpu":
         return "c"
-    one_gpu = jax.default_backend() == "gpu" and jax.device_count() == 1
-    return "warp" if one_gpu and importlib.util.find_spec("warp") else "mjx"
+    if jax.default_backend() != "gpu" or jax.device_count() > 1:
+        return "mjx"
+    if importlib.util.find_spec("warp"):
+        return "warp"
+    print("engine mjx; the engine warp is many times as fast on this GPU: pip install -r requirements-gpu.txt")
+    return "mjx"
 
 
 def make_engine(name, spec, decimation):

@@ -21,7 +21,7 @@ class ExploreConfig(Config):
 
     rough: float = 0.5  # share of episodes on rough ground
     amplitude: float = 0.05  # [m] of the rough ground, whose heights are 0 to twice this
-    spawn_spread: float = 4.0  # [m] half-width around the middle of either ground
+    spawn_xy: float = 4.0  # [m] half-width around the middle of either ground
     hasty: float = 0.2  # [s] shortest flight of a foot without a penalty
     perturb_force: float = 0.0  # [N] half-width of each component of a force on the base
     perturb_seconds: float = 2.0  # mean time between changes of the force; half of the draws are zero
@@ -52,7 +52,7 @@ class Explore(Env):
         k_xy, k_yaw, k_ground = jax.random.split(key, 3)
         c = self.config
         on_rough = uniform(k_ground, 0.0, 1.0) < c.rough
-        xy = uniform(k_xy, -c.spawn_spread, c.spawn_spread, (2,)) + jnp.array([terrain.ROUGH_CENTRE, 0.0]) * on_rough
+        xy = uniform(k_xy, -c.spawn_xy, c.spawn_xy, (2,)) + jnp.array([terrain.ROUGH_CENTRE, 0.0]) * on_rough
         return xy, uniform(k_yaw, -c.spawn_yaw, c.spawn_yaw)
 
     def on_rough(self, physics):

@@ -70,7 +70,7 @@ def load(path):
     path, wishes = read_wishes(path)
     spec, notes = reader.read(path), []
     refuse_what_cannot_be_walked(path, spec)
-    base = reader.base_of(path, spec, notes)
+    base = reader.free_the_base(path, spec, notes)
     if spec.tendons or any(one.gravcomp for one in spec.bodies):
         notes.append("tendons and gravity compensation are left out")
     lost = builder.simplify(path, spec, notes)

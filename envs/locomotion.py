@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from envs import rewards
 from envs.base import BODY, Env, FootClocks, joint_indices, select, soft_limits, uniform
 from envs.config import Config, Range
-from envs.rotations import axis_angle, inverse, rotate, wrap
+from envs.rotations import in_heading, rotate, wrap
 
 
 @dataclass(frozen=True)
@@ -40,6 +40,8 @@ class LocomotionConfig(Config):
         super().__post_init__()
         if (shares := self.turning + self.on_the_spot) > 1:
             raise ValueError(f"turning and on_the_spot are shares, together at most 1, not {shares:g}")
+        if not self.gait_hz and any(self.weights.get(term) for term in ("in_step", "foot_path")):
+            raise ValueError("in_step and foot_path need gait_hz above 0; set their weights to 0, too")
 
 
 @flax.struct.dataclass
@@ -209,8 +211,7 @@ class G1Locomotion(Locomotion):
 
     def tracked_velocity(self, motion):
         """As in every task, in the heading frame: a trunk that leans or pitches loses no reward."""
-        upright = axis_angle(jnp.array([0.0, 0, 1]), motion.yaw)
-        lin_vel, ang_vel = (rotate(inverse(upright), rotate(motion.quat, v)) for v in (motion.lin_vel, motion.ang_vel))
+        lin_vel, ang_vel = (in_heading(motion.yaw, rotate(motion.quat, v)) for v in (motion.lin_vel, motion.ang_vel))
         return jnp.append(lin_vel[:2], ang_vel[2])
 
 
@@ -241,7 +242,7 @@ ROBUST = {
     "tracking_seconds": 0.1,
 }
 ROBUST_QUADRUPED = ROBUST | {"lin_vel_x": (-1.0, 1.2), "gait_hz": 2.0}
-STEPS = {  # high, even steps with feet that do not slide, and rest where the command is to stand
+STEP_WEIGHTS = {  # high, even steps with feet that do not slide, and rest where the command is to stand
     "track_lin_vel": 4.0,
     "track_yaw_rate": 2.0,
     "in_step": 0.7,
@@ -281,7 +282,7 @@ ANYMAL_LOCO = LocomotionConfig(
     weights=ANYMAL_WEIGHTS,
     robust=ROBUST_QUADRUPED
     | {
-        "weights": ANYMAL_WEIGHTS | STEPS | {"torque": -2.5e-5},
+        "weights": ANYMAL_WEIGHTS | STEP_WEIGHTS | {"torque": -2.5e-5},
         "added_mass": (-5.0, 10.0),
         "joint_friction": (0.0, 0.3),
     },
@@ -313,7 +314,7 @@ GO1_LOCO = LocomotionConfig(
     weights=GO1_WEIGHTS,
     robust=ROBUST_QUADRUPED
     | {
-        "weights": GO1_WEIGHTS | STEPS,
+        "weights": GO1_WEIGHTS | STEP_WEIGHTS,
         "added_mass": (-1.0, 4.0),
         "joint_friction": (0.0, 0.3),
         # Its actions are small, a quarter of a radian: at 2 Hz it learns to step on the spot and nothing else.

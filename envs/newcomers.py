@@ -7,7 +7,7 @@ joints weigh as over Go1's twelve, torques as a share of the motors' limits.
 import dataclasses
 
 from envs.explore import EXPLORE, ExploreConfig
-from envs.locomotion import G1_LOCO, GO1_LOCO, ROBUST, ROBUST_QUADRUPED, STEPS
+from envs.locomotion import G1_LOCO, GO1_LOCO, ROBUST, ROBUST_QUADRUPED, STEP_WEIGHTS
 
 GO1_EFFORT = 4 * (2 * 23.7**2 + 35.55**2)  # [N^2 m^2] sum of its squared torque limits
 PER_JOINT = ("joint_acc", "joint_vel", "action", "action_rate", "pose", "stand_still")
@@ -38,7 +38,7 @@ def shared(body):
 
 def loco(body):
     """Config of velocity tracking for a body."""
-    weights, steps = scaled(GO1_LOCO.weights, body), scaled(STEPS, body)
+    weights, steps = scaled(GO1_LOCO.weights, body), scaled(STEP_WEIGHTS, body)
     robust = {"added_mass": tuple(body["added_mass"]), "joint_friction": (0.0, 0.01 * max(body["torque_limit"]))}
     if len(body["feet"]) > 2:
         robust |= ROBUST_QUADRUPED | {"weights": weights | steps, "gait_hz": 2.8, "stance": 0.5}

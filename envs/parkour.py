@@ -16,7 +16,7 @@ from envs import rewards, terrain
 from envs.base import BODY, Course, Env, select, uniform
 from envs.config import Config
 from envs.courses import SKILLS, all_slabs, draw_course
-from envs.rotations import axis_angle, inverse, rotate, wrap
+from envs.rotations import axis_angle, in_heading, rotate, wrap
 
 HEIGHT_GRID = np.stack(np.meshgrid(np.linspace(-1, 1, 21), np.linspace(-0.5, 0.5, 11), indexing="ij"), -1)  # [m]
 CEILING_GRID = np.stack(np.meshgrid(np.linspace(-1, 1, 11), np.linspace(-0.5, 0.5, 6), indexing="ij"), -1)
@@ -155,12 +155,10 @@ class Parkour(Env):
         return xy, uniform(k_yaw, -c.spawn_yaw, c.spawn_yaw)
 
     def ground_height(self, course, xy):
-        return self.heights(course.mocap_pos, course.mocap_quat, xy)
-
-    def heights(self, pos, quat, xy):
-        """Height of the ground [m] at xy (..., 2), given the slabs' poses. Ceilings do not count."""
+        """As in every task, also of a Motion or Physics, which know the slabs' places, too. Ceilings do not count."""
         ground = ~self.overhead
-        return terrain.top_heights(pos[ground], quat[ground], self.half[ground], xy, self.skill.floor)
+        pos, quat = course.mocap_pos[ground], course.mocap_quat[ground]
+        return terrain.top_heights(pos, quat, self.half[ground], xy, self.skill.floor)
 
     def init_task(self, key, physics, course):
         k_yaw, k_shift = jax.random.split(key)
@@ -192,7 +190,7 @@ class Parkour(Env):
         """Noisy readings as in every task, and scans of the ground (and a ceiling) around the base."""
         k_body, k_height, k_ceiling = jax.random.split(key, 3)
         sensed, prop = super().sense(k_body, motion, task)
-        ground = self.heights(motion.mocap_pos, motion.mocap_quat, self.grid(HEIGHT_GRID, motion, task))
+        ground = self.ground_height(motion, self.grid(HEIGHT_GRID, motion, task))
         noise = task.shift[2] + self.scan_noise(k_height, ground.shape)
         sensed["height"] = jnp.clip(motion.base_pos[2] - ground - 0.5 + noise, -1.0, 1.0)
         if self.overhead.any():
@@ -215,8 +213,7 @@ class Parkour(Env):
 
     def task_inputs(self, task, motion, clock):
         """Goal (3,) in the heading frame [m], time left as a share, sine and cosine of the heading error."""
-        upright = axis_angle(jnp.array([0.0, 0, 1]), motion.yaw)
-        goal = rotate(inverse(upright), task.goal - motion.base_pos)
+        goal = in_heading(motion.yaw, task.goal - motion.base_pos)
         goal *= jnp.minimum(1.0, 5.0 / (jnp.linalg.norm(goal) + 1e-6))  # at most 5 m
         error = wrap(task.goal_yaw - motion.yaw)
         return {
@@ -246,14 +243,14 @@ class Parkour(Env):
 
     def base_height(self, motion):
         """Height of the base above the ground under it [m]."""
-        return motion.base_pos[2] - self.heights(motion.mocap_pos, motion.mocap_quat, motion.base_pos[:2])
+        return motion.base_pos[2] - self.ground_height(motion, motion.base_pos[:2])
 
-    def touching_bodies(self, motion):
-        """Number of bodies other than feet that touch something."""
+    def touching_parts(self, motion):
+        """Number of parts other than feet that touch something; a knee and its shank are two."""
         return rewards.touching(motion.sensors[self.body_sensors])
 
     def before_rewards(self, task, motion):
-        feet_only = jnp.where(self.touching_bodies(motion) > 0, 0, task.feet_only + 1)
+        feet_only = jnp.where(self.touching_parts(motion) > 0, 0, task.feet_only + 1)
         foot_acc = (motion.foot_vel - task.foot_vel) / self.dt
         return task.replace(feet_only=feet_only, foot_vel=motion.foot_vel, foot_acc=foot_acc)
 
@@ -295,13 +292,13 @@ class Parkour(Env):
         """
         upright = jnp.clip(1.5 - self.tilt(motion) / (2 * UPRIGHT_TILT), 0.0, 1.0)  # 0 from 75 degrees
         high = jnp.clip(self.base_height(motion) / STANDING_HEIGHT, 0.0, 1.0)
-        return upright * high / (1 + self.touching_bodies(motion))
+        return upright * high / (1 + self.touching_parts(motion))
 
     def failed(self, task, motion):
         c = self.config
         base = jnp.linalg.norm(motion.sensors[self.end_sensors], axis=-1)
         feet = jnp.linalg.norm(motion.foot_force, axis=-1)
-        fallen = (-motion.gravity[2] < jnp.cos(jnp.deg2rad(c.max_tilt))) | (motion.base_pos[2] < c.lowest_base)
+        fallen = self.tilted(motion) | (motion.base_pos[2] < c.lowest_base)
         return jnp.any(base > c.base_force) | jnp.any(feet > c.foot_force) | fallen
 
     def task_metrics(self, task, motion, truncated):

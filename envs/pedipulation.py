@@ -1,7 +1,7 @@
 """Pedipulation with ANYmal D: stand or walk on three legs while the right front foot tracks a point (Arm et al. 2024).
 
-The point is drawn from a box around the start of the episode, and stays in the world for 6 s. The robot has to walk to
-far points. It is always the same foot, so there is no symmetry and no mirror loss.
+The point is drawn from a box before the robot, which starts in the origin, and stays in the world for 6 s. The robot
+has to walk to far points. It is always the same foot, so there is no symmetry and no mirror loss.
 """
 
 from dataclasses import dataclass
@@ -23,10 +23,8 @@ class PedipulationConfig(Config):
     """Numbers of pedipulation."""
 
     foot: str = "RF_foot"  # the foot that points
-    # [m] ranges of the point's x (forward), y (left) and z, from the start of the episode
+    # [m] ranges of the point's x (forward), y (left) and z, from the origin, where every episode starts
     box: tuple[Range, Range, Range] = ((0.0, 1.0), (-0.4, 0.2), (-0.1, 1.3))
-    final_box: tuple[Range, Range, Range] = ((0.0, 2.2), (-1.2, 1.2), (-0.1, 1.3))  # at the curriculum's end
-    curriculum: bool = False  # grow the box with the success of each environment (off in the paper)
     fixed_point: tuple[float, float, float] | None = None  # [m] the one point, for evaluation
     command_seconds: float = 6.0  # time between points
     all_feet_force: float = 0.0  # [N] largest constant force on every shank's centre of mass, per axis
@@ -38,9 +36,6 @@ class Task:
     """State of pedipulation."""
 
     point: jax.Array  # (3,) commanded foot position, world [m]
-    difficulty: jax.Array  # () growth of the box, 0 to 10; carried over resets
-    error_sum: jax.Array  # () [m] summed over the episode
-    steps: jax.Array  # () control steps in that sum
 
 
 class Pedipulation(Env):
@@ -50,6 +45,8 @@ class Pedipulation(Env):
     def __init__(self, config, engine="auto"):
         self.COMMAND_RANGES = dict(zip(("x [m]", "y [m]", "z [m]"), config.box, strict=True))
         super().__init__(config, engine)
+        if config.spawn_xy or config.spawn_yaw:
+            raise ValueError("spawn_xy and spawn_yaw must be 0 here: the point is drawn around the origin")
         if config.foot not in self.robot.feet:
             raise ValueError(f"unknown foot {config.foot!r}; choose one of {', '.join(self.robot.feet)}")
         self.mirrors = {}
@@ -60,24 +57,14 @@ class Pedipulation(Env):
         self.collision_sensors = self.engine.sensor(*parts, f"{config.foot}_force")
         self.command_steps = max(round(config.command_seconds / self.dt), 1)
 
-    def first_curriculum(self):
-        return {"difficulty": jnp.zeros(())}
-
-    def next_curriculum(self, key, task, motion, terminated, truncated):
-        """Grow this environment's box after an episode of little error (Arm et al. grow one box for all)."""
-        grown = truncated & (task.error_sum < 0.06 * task.steps) & self.config.curriculum
-        return {"difficulty": jnp.minimum(task.difficulty + grown, 10.0)}
-
     def init_task(self, key, physics, course):
-        zero, difficulty = jnp.zeros(()), course.curriculum["difficulty"]
-        return Task(self.draw_point(key, difficulty), difficulty, zero, zero)
+        return Task(self.draw_point(key))
 
-    def draw_point(self, key, difficulty):
-        """A point (3,) in the box of a difficulty."""
+    def draw_point(self, key):
+        """A point (3,) in the box."""
         if self.config.fixed_point is not None:
             return jnp.array(self.config.fixed_point)
-        start, end = jnp.array(self.config.box), jnp.array(self.config.final_box)
-        low, high = (start + difficulty / 10 * (end - start)).T
+        low, high = jnp.array(self.config.box).T
         return uniform(key, low, high, (3,))
 
     def set_command(self, task, command):
@@ -87,13 +74,9 @@ class Pedipulation(Env):
         """The commanded point (1, 3)."""
         return task.point[None]
 
-    def before_rewards(self, task, motion):
-        error = self.foot_error(task, motion)
-        return task.replace(error_sum=task.error_sum + error, steps=task.steps + 1)
-
     def after_rewards(self, key, task, motion, clock):
         due = clock % self.command_steps == 0
-        return task.replace(point=jnp.where(due, self.draw_point(key, task.difficulty), task.point))
+        return task.replace(point=jnp.where(due, self.draw_point(key), task.point))
 
     def spawn(self, key, course):
         """Physics as in every task, with a constant force on each foot, at the centre of mass of its shank."""

@@ -63,8 +63,8 @@ def one_line(error):
 # --- the trunk ---
 
 
-def base_of(path, spec, notes):
-    """Name of the trunk: the body of the free joint, which is added where the trunk hangs in the world."""
+def free_the_base(path, spec, notes):
+    """Add the free joint where the trunk hangs in the world, and name nameless parts. Returns the trunk's name."""
     free = [body for body in spec.bodies if any(joint.type == JOINT.mjJNT_FREE for joint in body.joints)]
     if len(free) > 1:
         raise ValueError(

@@ -37,12 +37,17 @@ def film(env, qpos, course, start=4.0, strip_seconds=0.6, strip_frames=10, gif_s
     for i, image in images.items():
         stamp(image, f"{i * env.dt:.2f} s", title)
 
-    sheet = Image.new("RGB", (WIDTH * 5, HEIGHT * -(-len(strip) // 5)), "white")
-    for place_in_sheet, i in enumerate(strip):
-        sheet.paste(images[i], (place_in_sheet % 5 * WIDTH, place_in_sheet // 5 * HEIGHT))
-    png = io.BytesIO()
-    sheet.save(png, "PNG", optimize=True)
-    return {"rollout.png": png.getvalue(), "rollout.gif": gif_bytes([images[i] for i in moving], env.dt)}
+    frames = [images[i] for i in moving]
+    return {"rollout.png": sheet([images[i] for i in strip], 5), "rollout.gif": gif_bytes(frames, env.dt)}
+
+
+def sheet(images, columns):
+    """Images of the usual size beside and below each other, as a PNG."""
+    page, png = Image.new("RGB", (columns * WIDTH, -(-len(images) // columns) * HEIGHT), "white"), io.BytesIO()
+    for i, image in enumerate(images):
+        page.paste(image, (i % columns * WIDTH, i // columns * HEIGHT))
+    page.save(png, "PNG", optimize=True)
+    return png.getvalue()
 
 
 def stamp(image, time, title):

@@ -27,6 +27,11 @@ def inverse(quat):
     return quat * jnp.array([1.0, -1, -1, -1])
 
 
+def in_heading(yaw, vec):
+    """World vector (3,) in the frame that is turned by yaw () [rad] about the vertical alone."""
+    return rotate(inverse(axis_angle(jnp.array([0.0, 0, 1]), yaw)), vec)
+
+
 def yaw_of(quat):
     """Heading () [rad] of an orientation (4,)."""
     w, x, y, z = quat

@@ -4,7 +4,6 @@ The scripts read as for one device. The compiler adds the communication where th
 statistics are means over all environments, and minibatches are shuffled within each device's block of them.
 """
 
-import math
 import os
 import sys
 
@@ -58,6 +57,15 @@ def is_first():
     return jax.process_index() == 0
 
 
+def any_process(asked):
+    """True if it is so in one of the processes: all of them have to stop in the same row."""
+    if jax.process_count() == 1:
+        return asked
+    from jax.experimental import multihost_utils
+
+    return bool(np.any(multihost_utils.process_allgather(np.array(asked))))
+
+
 def check_engine(engine):
     """Raise ValueError if this engine cannot use the present devices."""
     name = type(engine).__name__.removesuffix("Engine").lower()
@@ -73,7 +81,7 @@ def mesh():
     return Mesh(np.array(jax.devices()), ("devices",))
 
 
-def same():
+def replicated():
     """Sharding of an array of which every device has a copy."""
     return NamedSharding(mesh(), PartitionSpec())
 
@@ -85,7 +93,7 @@ def split(axis):
 
 def of_state(state, axis):
     """Shardings of a TrainState: its environments, on this axis of `env`, are split."""
-    return jax.tree.map(lambda _: same(), state).replace(env=jax.tree.map(lambda _: split(axis), state.env))
+    return jax.tree.map(lambda _: replicated(), state).replace(env=jax.tree.map(lambda _: split(axis), state.env))
 
 
 def place(tree, shardings):
@@ -107,7 +115,9 @@ def mean_in_pieces(function, batch):
     """
     size = len(jax.tree.leaves(batch)[0])
     alone = jax.default_backend() == "cpu" and jax.device_count() == 1
-    count = math.gcd(size, 1 << ((size - 1) // PIECE).bit_length()) if alone else 1
+    count = 1
+    while alone and size // count > PIECE and size % (2 * count) == 0:
+        count *= 2
     pieces = jax.tree.map(lambda x: x.reshape(count, size // count, *x.shape[1:]), batch)
     zero = jax.tree.map(jnp.zeros_like, jax.eval_shape(function, jax.tree.map(lambda x: x[0], pieces)))
 

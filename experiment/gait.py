@@ -37,7 +37,7 @@ COMMANDS = {  # forward, sideways [m/s], turning [rad/s]
 }
 SEQUENCES = ("switches", "reverse")
 USUAL = "forward 0.8"  # the command whose gait the summary describes
-REVERSED = -0.4  # [m/s] mean forward speed of the last two seconds that counts as reversed
+REVERSED = -0.4  # [m/s] mean forward speed in the last fifth of an episode that counts as reversed
 
 
 @dataclass
@@ -77,7 +77,10 @@ class Recording:
 
 
 def starts_of(name, starts):
-    """Number of episodes of a command or sequence where most commands have `starts`: the two arcs share them."""
+    """Number of episodes of a command or sequence where most commands have `starts`.
+
+    The two arcs share them; more reverse, which is the harder test.
+    """
     if name.startswith("arc"):
         return max(1, starts // 2)
     return round(1.2 * starts) if name == "reverse" else starts
@@ -120,8 +123,8 @@ def fallen(recording):
 
 
 def reversals(recording):
-    """Number of episodes that go backward in their last two seconds, without a fall."""
-    last = recording.lin_vel[-round(2 / recording.dt) :, :, 0].mean(0)
+    """Number of episodes that go backward in their last fifth, without a fall."""
+    last = recording.lin_vel[-(len(recording.alive) // 5) :, :, 0].mean(0)
     return float(np.sum((last <= REVERSED) & ~fallen(recording)))
 
 
@@ -181,9 +184,9 @@ def swings(r, rows, touching, body):
 
 
 def is_left(foot):
-    """True for a left foot, by its name: left_foot, leg_l_foot, LF_foot, RL_foot (rear left), LM (middle)."""
-    words = re.split(r"[_-]", foot.lower())
-    return bool({"left", "l"} & {*words} or re.fullmatch(r"l[fmhrb]|[fmhrb]l", words[0]))
+    """True for a left foot, by its name: left_foot, LeftFoot, leg_l_foot, LF_foot, RL_foot (rear left), LM (middle)."""
+    words = [word.lower() for word in re.findall(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])", foot)]
+    return bool({"left", "l", "lleg"} & {*words} or re.fullmatch(r"l[fmhrb]|[fmhrb]l", words[0] if words else ""))
 
 
 def feet(r, rows, body):

@@ -1,4 +1,4 @@
-"""Progress of a run on the terminal and in TensorBoard, and the wish to stop it."""
+"""Progress of a run on the terminal and in TensorBoard, and the request to stop it."""
 
 import signal
 import sys
@@ -23,10 +23,10 @@ class Progress:
     def __enter__(self):
         self.handlers = {sign: signal.signal(sign, self.stop) for sign in (signal.SIGINT, signal.SIGTERM)}
         if sys.stdout and sys.stdout.isatty():
-            from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+            from rich import progress as rich
 
-            columns = BarColumn(bar_width=20), TextColumn("{task.percentage:.0f}%"), TimeRemainingColumn()
-            self.bar = Progress(*columns, TextColumn("{task.description}"))
+            shown = rich.BarColumn(bar_width=20), rich.TextColumn("{task.percentage:.0f}%"), rich.TimeRemainingColumn()
+            self.bar = rich.Progress(*shown, rich.TextColumn("{task.description}"))
             self.bar.start()
             self.task = self.bar.add_task("starting", total=self.total)
         return self

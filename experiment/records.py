@@ -48,10 +48,11 @@ def one_line_errors():
     try:
         yield
     except (UserError, OSError, MemoryError, jax.errors.JaxRuntimeError) as error:
-        if isinstance(error, BrokenPipeError):  # who read the output, as in `| head`, is gone
+        if isinstance(error, BrokenPipeError):  # the reader of our output, as in `| head`, has left
             sys.stdout = open(os.devnull, "w")  # noqa: SIM115, for the rest of the process
             sys.exit(1)
-        fail(in_one_line(error))
+        print(f"error: {in_one_line(error)}", file=sys.stderr)
+        sys.exit(2)
     except KeyboardInterrupt:
         sys.exit("interrupted")
     finally:
@@ -71,12 +72,6 @@ def in_one_line(error):
         what = str(error).split("\n")[0][:120]
         return f"out of memory; lower --num-envs or --num-seeds, in stage 2 --batch ({what})"
     raise error
-
-
-def fail(text):
-    """Print one error line and exit with code 2."""
-    print(f"error: {text}", file=sys.stderr)
-    sys.exit(2)
 
 
 CLAIMS = {}  # run folder -> descriptor, whose lock keeps other processes out
@@ -167,12 +162,13 @@ ABOVE_0 = ("lr", "max_lr", "ensemble_lr", "desired_kl", "init_std", "clip", "max
 def filled(args, values):
     """The arguments with fields that are None filled in from `values`; UserError unless all counts are at least 1.
 
-    --seed is from 0 on, and of 32 bits, for JAX drops the others. Counts are below 1e12, as --resume wants them. Step
+    Seeds are from 0 on and fit 32 bits: JAX ignores higher ones. Counts are below 1e12, as --resume wants them. Step
     sizes and stds are above 0.
     """
     args = dataclasses.replace(args, **{name: v for name, v in values.items() if getattr(args, name) is None})
     for name, value in dataclasses.asdict(args).items():
-        flag, (least, most) = f"--{name.replace('_', '-')}", (0, 2**32) if name == "seed" else (1, 10**12)
+        flag = f"--{name.replace('_', '-')}"
+        least, most = (0, 2**32 - getattr(args, "num_seeds", 1) + 1) if name == "seed" else (1, 10**12)
         for number in value if type(value) is tuple else (value,):
             if type(number) is int and not least <= number < most:
                 raise UserError(f"{flag} must be at least {least}, not {number}, and below {most}")
@@ -191,8 +187,9 @@ def check_minibatches(args):
         )
     if size // args.shuffle_blocks % args.num_minibatches:
         raise UserError(
-            f"{args.num_minibatches} minibatches do not divide a rollout of {args.num_envs} environments x "
-            f"{args.num_steps} steps = {size}; change --num-minibatches or --num-envs"
+            f"{args.num_minibatches} minibatches do not divide the {size // args.shuffle_blocks} samples of a block: "
+            f"{args.num_envs} environments x {args.num_steps} steps / {args.shuffle_blocks}; "
+            "change --num-minibatches or --num-envs"
         )
     return args
 
@@ -271,17 +268,20 @@ RESULTS = (
     "rollout.png",
     "rollout.gif",
     "nan.npz",
+    "curve.png",
+    "accuracy.png",
+    "distribution.png",
 )
 
 
-def load_policy(path, like, env):
+def load_networks(path, like, env):
     """Params of a policy file, but with the action std of `like`. UserError if it lacks the leaves and shapes of that.
 
     A trained policy has a small std, with which it would hardly explore. UserError also if it is of another robot,
     body, observation or network.
     """
     params, meta = load(Path(path), "policy")
-    family, config = envs.TASKS.get(meta["task"], (None, None))  # of a robot from a file, whose body tells it apart
+    family, config = (envs.TASKS | envs.OWN).get(meta["task"], (None, None))  # robots from a file differ in body
     if config and config.robot != env.robot.name:
         raise UserError(f"{path} is a policy for robot {config.robot}, here is robot {env.robot.name}")
     if family and [*family.OBS] != [*type(env).OBS]:  # of as many numbers, say
@@ -321,6 +321,12 @@ def check_body(path, meta, env):
     theirs, ours = (body.get("digest", "none: a shipped robot") for body in (meta.get("body", {}), env.config.body))
     if theirs != ours:
         raise UserError(f"{path} was made for another body: its digest is {theirs}, here it is {ours}")
+
+
+def read_rows(path):
+    """Rows of numbers that `save_rows` wrote to a metrics.csv."""
+    with path.open() as file:
+        return [{name: float(value) for name, value in row.items()} for row in csv.DictReader(file)]
 
 
 def finite(tree):

@@ -18,15 +18,18 @@ import jax
 import jax.numpy as jnp
 
 from envs import loader
+from envs.config import FIXED
 from experiment import devices, figures, metrics, records
 from experiment.progress import Progress
 
 
 def typed(words):
-    """Fields of a config as typed after --set, name -> text."""
+    """Fields of a config as typed after --set, name -> text. UserError for those that cannot be set."""
     for word in words:
         if "=" not in word:
             raise records.UserError(f"--set takes NAME=VALUE, not {word!r}")
+        if (name := word.split("=", 1)[0]) in FIXED:
+            raise records.UserError(f"{name} cannot be set: {FIXED[name]}")
     return dict(word.split("=", 1) for word in words)
 
 
@@ -55,15 +58,15 @@ def each_seed(args):
 
 
 class Run:
-    """Folders and rows of one run. Processes but the first keep rows and write nothing."""
+    """Folders and rows of one run. Of several processes only the first one writes."""
 
     def __init__(self, args, config, total, shown, over="env_steps"):
         """args and config are recorded in args.json; total: iterations of the run; for the rest see Progress."""
         self.args, self.config, self.total, self.shown, self.over = args, config, total, shown, over
         self.body = getattr(config, "body", {})  # of a robot from a file
-        self.each = each_seed(args)
-        self.folders = [Path(one.run_dir) if devices.is_first() else None for one in self.each]
-        self.rows = [[] for _ in self.each]
+        self.each_args = each_seed(args)
+        self.folders = [Path(one.run_dir) if devices.is_first() else None for one in self.each_args]
+        self.rows = [[] for _ in self.each_args]
         self.iteration, self.stopped = 0, False
 
     def start(self, init):
@@ -85,9 +88,9 @@ class Run:
             if self.done:
                 print(f"{self.args.resume} has all its rows already; nothing is left to train")
             return [state]
-        states = [init(one) for one in self.each]
+        states = [init(one) for one in self.each_args]
         if devices.is_first():
-            records.start_runs(self.each, self.config)
+            records.start_runs(self.each_args, self.config)
         return states
 
     def compile(self, function, *inputs):
@@ -124,7 +127,7 @@ class Run:
 
     def log(self, iteration, each_metrics):
         """Add a row for each seed, from its metrics (log_every,) up to this iteration."""
-        pairs = zip(self.each, each_metrics, strict=True)
+        pairs = zip(self.each_args, each_metrics, strict=True)
         self.add([metrics.make_row(args, int(iteration), self.seconds(), jax.device_get(one)) for args, one in pairs])
 
     def add(self, new):
@@ -134,16 +137,17 @@ class Run:
             rows.append(row)
             if folder:
                 records.save_rows(folder / "metrics.csv", rows)
-        now, work = time.perf_counter(), len(self.each) * (new[0][self.over] - before)
+        now, work = time.perf_counter(), len(self.each_args) * (new[0][self.over] - before)
         self.progress.show(metrics.mean_row(new), work / (now - self.last))
-        self.iteration, self.stopped, self.last = int(new[0]["iteration"]), self.progress.stopped, now
+        self.iteration, self.last = int(new[0]["iteration"]), now
+        self.stopped = devices.any_process(self.progress.stopped)
 
     def save_policies(self, before, states):
         """Replace the policy.msgpack of each seed and, every save_minutes, save the states (S, ...).
 
         If weights are not finite, save the state `before` the last chunk and raise a UserError.
         """
-        for args, folder, params in zip(self.each, self.folders, unstack(states.params), strict=True):
+        for args, folder, params in zip(self.each_args, self.folders, unstack(states.params), strict=True):
             if not records.finite(params):
                 self.rows = [rows[:-1] for rows in self.rows]
                 self.save(unstack(before))
@@ -177,7 +181,7 @@ class Run:
         if self.stopped and jax.process_count() > 1:
             print("interrupted; runs of several processes save no state to go on from")
         elif self.stopped:
-            print(f"interrupted; --resume {' or '.join(args.run_dir for args in self.each)} goes on from here")
+            print(f"interrupted; --resume {' or '.join(args.run_dir for args in self.each_args)} goes on from here")
 
 
 def stack(trees):

@@ -166,7 +166,8 @@ CLOCK = ("stance", "swing_height", "march")  # of the gait's clock, read only if
 def task_of(config):
     """A run's config as args.json has it, in a form in which runs of the same task are equal, whatever their age."""
     known = (LATER | config).items()
-    task = {name: value for name, value in known if name not in ("robust", "body")}  # what --robust, --robot would set
+    other = ("robust", "body", "curriculum", "final_box")  # what --robust and --robot would set; what is gone
+    task = {name: value for name, value in known if name not in other}
     if isinstance(seconds := task.get("command_seconds"), float):
         task["command_seconds"] = [seconds, seconds]
     return {name: value for name, value in task.items() if task["gait_hz"] or name not in CLOCK}

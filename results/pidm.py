@@ -57,8 +57,7 @@ class Args:
 
 def copy(source, target):
     """Copy a file, making its folder."""
-    target.parent.mkdir(parents=True, exist_ok=True)
-    records.replace_bytes(target, source.read_bytes())
+    records.write(target, source.read_bytes())
 
 
 def keep(robot):

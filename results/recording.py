@@ -31,14 +31,8 @@ def run_script(words, log=None, seconds=None):
     return True
 
 
-def finetune(words, log=None, seconds=None):
-    """`run_script` for ppo_finetune.py."""
-    return run_script(["ppo_finetune.py", *words], log, seconds)
-
-
 def evaluate(run, folder, names, log=None):
     """Evaluate the policy of runs/<run>, and copy the files `names` of the run to `folder`."""
     run_script(["play.py", f"runs/{run}/policy.msgpack"], log)
-    folder.mkdir(parents=True, exist_ok=True)
     for name in names:
-        records.replace_bytes(folder / name, (ROOT / "runs" / run / name).read_bytes())
+        records.write(folder / name, (ROOT / "runs" / run / name).read_bytes())

@@ -11,7 +11,6 @@ A run is in runs/study/<scale>/<task>/<method>/seed<k>. Its small files are kept
 report.py reads them. Scales never mix.
 """
 
-import csv
 import json
 import sys
 import time
@@ -33,7 +32,7 @@ KEPT = ("args.json", "metrics.csv", "eval.json")
 
 @dataclass(frozen=True)
 class Args:
-    """Without tasks, methods or seeds it is all of them that are planned."""
+    """Leave out tasks, methods or seeds to run all that are planned."""
 
     tasks: tuple[str, ...] = ()
     methods: tuple[str, ...] = ()
@@ -77,10 +76,11 @@ class Cell:
         """Share of its steps that the run has made, None before its first row."""
         run = ROOT / "runs" / self.folder
         try:
-            with (run / "metrics.csv").open() as file:
-                rows = list(csv.DictReader(file))
-            return float(rows[-1]["env_steps"]) / json.loads((run / "args.json").read_text())["total_steps"]
-        except (OSError, ValueError, KeyError, IndexError):
+            return (
+                records.read_rows(run / "metrics.csv")[-1]["env_steps"]
+                / json.loads((run / "args.json").read_text())["total_steps"]
+            )
+        except (OSError, ValueError, KeyError, IndexError, TypeError):
             return None
 
     def lacks(self):
@@ -137,7 +137,7 @@ def run(cell, seconds):
     log = ROOT / "runs" / cell.folder / "log.txt"
     log.parent.mkdir(parents=True, exist_ok=True)
     with log.open("a") as file:
-        ended = recording.finetune(cell.words(), file, seconds)
+        ended = recording.run_script(["ppo_finetune.py", *cell.words()], file, seconds)
         if not ended or (cell.share() or 0) < 1:  # a training that was asked to stop ends well, too
             return False
         recording.evaluate(cell.folder, ROOT / "results" / cell.folder, KEPT, file)
@@ -149,6 +149,8 @@ def main(args):
     if args.status:
         return show_status(runs)
     missing = [cell for cells in runs.values() for cell in cells if not cell.done()]
+    if not missing:
+        print("all of these runs are recorded under results/study; to repeat one, first move its folder away")
     for path in dict.fromkeys(filter(None, (cell.lacks() for cell in missing))):
         print(f"left out: runs from {path}, which is missing; results/pidm.py makes it", file=sys.stderr)
     start = time.perf_counter()

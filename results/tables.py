@@ -3,7 +3,6 @@
 A study is task -> method -> runs. A table is a list of lines of Markdown.
 """
 
-import csv
 import itertools
 import json
 import os
@@ -12,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from experiment import records
 from results import drawing, measures
 from results.grid import METHODS, SCALES, TABLE_1, TASKS, is_earlier, task_of
 from results.measures import MEASURES
@@ -83,9 +83,8 @@ def load_run(folder, evaluated=True):
     try:
         record = json.loads((folder / "args.json").read_text())
         result = json.loads((folder / "eval.json").read_text()) if evaluated else {}
-        with (folder / "metrics.csv").open() as file:
-            rows = list(csv.DictReader(file))
-        columns = {name: np.array([float(row[name]) for row in rows]) for name in rows[0]}
+        rows = records.read_rows(folder / "metrics.csv")
+        columns = {name: np.array([row[name] for row in rows]) for name in rows[0]}
         complete = bool(columns["env_steps"][-1] >= float(record["total_steps"]))
         keys = ("num_envs", "num_steps", "total_steps", "lr", "num_epochs", "mirror_coef")
         success = {name: one["episode_success"] for name, one in result.items() if name.startswith("level ")}
@@ -435,7 +434,6 @@ def sizes_of(robot):
     folder, found = ROOT / f"results/pidm/{robot}", {}
     for path in [*folder.glob("sizes/*_validation.json"), folder / "validation.json"]:
         stem = path.stem.removesuffix("validation")
-        with path.with_name(f"{stem}metrics.csv").open() as file:
-            count = int(float(next(csv.DictReader(file))["samples"]))  # of the first epoch
+        count = int(records.read_rows(path.with_name(f"{stem}metrics.csv"))[0]["samples"])  # of the first epoch
         found[count] = json.loads(path.read_text())["error_rad"]
     return dict(sorted(found.items()))

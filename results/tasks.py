@@ -9,7 +9,6 @@ If a task has levels, levels.png shows the share of environments at each level a
 episodes there in which the trained policy's mean action succeeds.
 """
 
-import csv
 import json
 import sys
 from dataclasses import dataclass
@@ -38,13 +37,12 @@ class Args:
 
 def draw_levels(folder):
     """Draw levels.png of a kept run."""
-    with (folder / "metrics.csv").open() as file:
-        last = list(csv.DictReader(file))[-1]
+    last = records.read_rows(folder / "metrics.csv")[-1]
     result = json.loads((folder / "eval.json").read_text())
     names = [name for name in last if name.startswith("level/")]
     level = np.arange(len(names))
     fig, ax = figures.pyplot().subplots(figsize=(4.5, 2.8), constrained_layout=True)
-    ax.bar(level - 0.2, [float(last[name]) for name in names], 0.4, label="environments at the end of training")
+    ax.bar(level - 0.2, [last[name] for name in names], 0.4, label="environments at the end of training")
     success = [result[f"level {i}"]["episode_success"] for i in level]
     ax.bar(level + 0.2, success, 0.4, label="success of the mean action")
     ax.set(xlabel=f"level of {folder.name}", xticks=level, ylim=(0, 1))
@@ -59,7 +57,8 @@ def main(args):
     for task in args.tasks:
         run, folder = f"tasks/{task}", ROOT / "results/tasks" / task
         if "train" in args.stages:
-            recording.finetune(["--task", task, "--preset", args.preset, "--run-dir", f"runs/{run}", "--force"])
+            words = ["--task", task, "--preset", args.preset, "--run-dir", f"runs/{run}", "--force"]
+            recording.run_script(["ppo_finetune.py", *words])
         if "look" in args.stages:
             recording.evaluate(run, folder, KEPT)
             if envs.TASKS[task][0].LEVELS:

@@ -512,7 +512,7 @@ def test_weights_follow_the_body(bodies):
     assert two_feet.gait_hz > 0 == four_feet.gait_hz and two_feet.march > four_feet.march
 
 
-def test_a_run_is_repeatable_without_its_file(write, tmp_path, refused, capsys):
+def test_a_run_is_repeatable_without_its_file(write, tmp_path, refused, capsys, monkeypatch):
     """args.json holds the body; a checkpoint of another one is refused, in one line."""
     path = write(quadruped())
     args = {"task": "loco", "preset": "smoke", "total_steps": 32, "run_dir": str(tmp_path / "run")}
@@ -527,8 +527,12 @@ def test_a_run_is_repeatable_without_its_file(write, tmp_path, refused, capsys):
         robot=str(longer), policy=str(tmp_path / "run/policy.msgpack"), **args | {"run_dir": str(tmp_path / "b")}
     )
     refused(ppo_finetune.main, again, "another body", meta["body"]["digest"])
+    monkeypatch.setattr(replay, "trace", lambda *_: (jnp.zeros(1),) * 6 + (jnp.zeros((1, 4), bool),))
+    monkeypatch.setattr(
+        ppo_finetune, "iteration", lambda *parts: (parts[-1].replace(iteration=parts[-1].iteration + 1), {})
+    )
     replay.main(replay.Args(str(tmp_path / "run"), iterations=1))
-    assert "nothing failed" in capsys.readouterr().out
+    assert "nothing failed from iteration 2 to 2" in capsys.readouterr().out
     assert envs.label("loco", str(record)) == "dog_loco"
 
 

@@ -1,6 +1,7 @@
 """From what robots report in a step to rows, curves and lines: against plain loops over made-up numbers."""
 
 import csv
+import sys
 import time
 import types
 
@@ -11,6 +12,7 @@ import pytest
 
 import ppo_finetune
 from experiment import figures, metrics, records
+from experiment.progress import Progress
 from experiment.run import Run
 
 CHUNKS, T, N = 3, 5, 4  # iterations per row, control steps, environments
@@ -105,6 +107,17 @@ class Policy:
     params: dict
 
 
+def test_flat_and_rough_ground_have_their_own_line(monkeypatch, tmp_path):
+    drawn = {}
+    monkeypatch.setattr(
+        figures, "save", lambda fig, path: drawn.update({p.get_label(): p.get_data() for p in fig.axes[0].patches})
+    )
+    magnitude, rough = np.repeat([0.1, 0.9], [60, 20]).reshape(40, 2), np.arange(40) >= 30
+    figures.plot_distribution(magnitude, rough, tmp_path / "x.png")
+    modes = {name: line.edges[np.argmax(line.values)] for name, line in drawn.items()}
+    assert modes["flat"] < 0.2 < 0.8 < modes["rough"]
+
+
 def test_a_run_of_two_seeds_on_disk_and_on_the_screen(tmp_path, monkeypatch, capsys):
     """Each seed's rows in its own folder, their mean and the speed of both in the line. It is done at the last row."""
     now = [100.0]
@@ -129,6 +142,14 @@ def test_a_run_of_two_seeds_on_disk_and_on_the_screen(tmp_path, monkeypatch, cap
         assert [float(row["seconds"]) for row in rows] == [30.0, 80.0]
         want = [made_up(10 * number + seed).metrics["lin_vel_error"].mean() for number in (1, 2)]
         np.testing.assert_allclose([float(row["lin_vel_error"]) for row in rows], want, rtol=1e-5)
+
+
+def test_on_a_terminal_there_is_a_bar(monkeypatch):
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True, raising=False)
+    with Progress(10, ("kl",)) as progress:
+        progress.show({"env_steps": 2e6, "iteration": 4, "seconds": 1.0, "kl": 0.5}, 100.0)
+        (task,) = progress.bar.tasks
+    assert (task.completed, task.total) == (4, 10) and "2.00M steps  100/s  kl 0.5" in task.description
 
 
 def test_weights_that_are_not_finite_are_never_saved(tmp_path):

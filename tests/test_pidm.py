@@ -224,7 +224,7 @@ def test_data_of_another_time_step_make_a_pidm_of_that_time_step(folder, tmp_pat
 def test_training_samples_are_of_training_environments_alone(folder, tmp_path, monkeypatch):
     """As many as --num-samples asks for, each once. Their statistics are of noisy readings."""
     seen, run_epoch, make_normalizer = [], script.run_epoch, script.make_normalizer
-    norms = []
+    norms, judged, predict_all = [], [], script.predict_all
 
     def watched(args, data, index, *rest):
         seen.append((index, data))
@@ -236,11 +236,51 @@ def test_training_samples_are_of_training_environments_alone(folder, tmp_path, m
 
     monkeypatch.setattr(script, "run_epoch", watched)
     monkeypatch.setattr(script, "make_normalizer", kept)
+    monkeypatch.setattr(script, "predict_all", lambda *parts: judged.append(parts[-1]) or predict_all(*parts))
     script.main(script.Args(data=str(folder), preset="smoke", num_samples=60, run_dir=str(tmp_path / "run")))
     index, data = seen[0]
     assert len(index) == len({*index}) == 60 and {*index} <= {*data.train.tolist()}
     variance = np.square(norms[-1]["prop_std"])[18:]  # of joint velocities, whose noise is even within 1.5
     assert np.mean(variance) == pytest.approx(1 + 1.5**2 / 3, rel=0.1)
+    held_out = {*data.validation.tolist()}
+    assert [{*one} for one in judged] == [held_out] * 3, "two epochs and validation.json"
+
+
+def test_an_epoch_takes_each_sample_once_with_noise_of_its_own(dataset):
+    """40 of 43 in batches of 8, in an order and with keys that seed and epoch alone decide."""
+    index, args = dataset.train[:43], script.Args(batch=8, epochs=9, seed=2)
+    known = {float(a): i for i, a in zip(index, dataset.windows(index)["action"][:, 0], strict=True)}
+
+    def epoch(number):
+        taken, keys = [], []
+
+        def step(variables, opt_state, batch, key, lr):
+            taken.extend(known[float(a)] for a in np.asarray(batch["action"])[:, 0])
+            keys.append(tuple(jax.random.key_data(key).tolist()))
+            return variables, opt_state, jnp.float32(len(keys))
+
+        assert script.run_epoch(args, dataset, index, step, ({}, {}), [1.0] * number)[1] == 3.0
+        assert len({*taken}) == len(taken) == 40
+        return taken, keys
+
+    first, again, second = epoch(0), epoch(0), epoch(1)
+    assert first == again and first[0] != second[0] and len({*first[1], *second[1]}) == 10
+
+
+def test_an_error_that_is_not_finite_saves_nothing(folder, tmp_path, monkeypatch, refused):
+    """Weights that break in the last step of an epoch have a sound loss, but no sound error."""
+    errors, out = script.errors, tmp_path / "run"
+    args = script.Args(data=str(folder), preset="smoke", epochs=3, run_dir=str(out))
+    count = []
+
+    def broken(*parts):
+        count.append(1)
+        return errors(*parts) | ({"error": float("nan")} if len(count) == 2 else {})
+
+    monkeypatch.setattr(script, "errors", broken)
+    refused(script.main, args, "the error is not finite after epoch 2")
+    script.main(script.Args(resume=str(out)))
+    assert [row["iteration"] for row in records.read_rows(out / "metrics.csv")] == [1, 2, 3]
 
 
 @pytest.fixture
@@ -284,7 +324,7 @@ def test_the_step_size_falls_once_three_epochs_bring_nothing(errors, starts):
 def test_patience_ends_a_training_which_resumes_to_the_same_weights(folder, tmp_path, monkeypatch, step_sizes):
     """Errors that fall for three epochs only: two more at --lr, two in which it falls. Killed in each, it goes on."""
     made_up, killed, run_epoch, errors = [5, 4, 3, 3, 3, 2, 4, 1], [], script.run_epoch, script.errors
-    past = []
+    past, judged = [], []
 
     def killable(*parts):
         past[:] = parts[-1]
@@ -294,11 +334,13 @@ def test_patience_ends_a_training_which_resumes_to_the_same_weights(folder, tmp_
 
     monkeypatch.setattr(script, "run_epoch", killable)
     monkeypatch.setattr(script, "errors", lambda *parts: errors(*parts) | {"error": made_up[len(past)]})
+    monkeypatch.setattr(script, "validate", lambda predictor, env, variables, *_: judged.append(variables))
     args = script.Args(data=str(folder), preset="smoke", epochs=20, patience=2, run_dir=str(tmp_path / "whole"))
     script.main(args)
     whole = records.load(tmp_path / "whole/pidm.msgpack", "PIDM checkpoint")
     sizes, per_epoch = [*step_sizes], len(step_sizes) // 7
     assert len(sizes) == 7 * per_epoch and whole[1]["metrics"]["iteration"] == 6, "the best epoch is kept"
+    jax.tree.map(np.testing.assert_array_equal, judged[0], whole[0])
     assert sizes[: 5 * per_epoch] == [np.float32(args.lr)] * 5 * per_epoch
     assert sizes[-2 * per_epoch] == np.float32(args.lr) and sizes[-1] < 0.6 * args.lr
     killed[:], step_sizes[:] = (2, 4, 6), []  # before it is flat, while it is, and as the step size falls
@@ -392,7 +434,7 @@ def test_a_robot_without_a_shipped_checkpoint(pretrained, jitted, tmp_path, monk
     monkeypatch.setitem(envs.TASKS, "stand", (pedipulation.Pedipulation, envs.TASKS["go1_loco"][1]))
     records.save(policy, saved, {"task": "stand", "args": {}})
     with pytest.raises(records.UserError, match=r"sees lin_vel, .*, target; this task has lin_vel, .*, command, "):
-        records.load_policy(policy, saved, env)  # as many numbers in another order
+        records.load_networks(policy, saved, env)  # as many numbers in another order
     with pytest.raises(records.UserError, match="--load-into none"):
         start(env)
     other = finetune.Args(pretrained=str(pretrained / "pidm.msgpack"), load_into="none")
@@ -519,6 +561,8 @@ def test_first_weights_are_as_pytorch_makes_them(network, last, jitted, first_ro
         np.testing.assert_array_equal(scaled[name][0], factor * kernel)
         np.testing.assert_array_equal(scaled[name][1], factor * bias)
     assert sum("actor" in name and name.endswith(last) for name in whole) == 1
+    _, params = first_state(env, states, "go1_loco", network=network, init_std=0.4)
+    np.testing.assert_allclose(np.exp(params["params"]["log_std"]), 0.4, rtol=1e-6)
     for kernel, bias in orthogonal.values():
         small = kernel if kernel.shape[0] < kernel.shape[1] else kernel.T
         gram = small @ small.T
@@ -541,14 +585,13 @@ def test_parameter_ratio(task):
 
 
 def test_commanded_change_is_target_minus_joint_angle(go1):
-    """Targets of MuJoCo's position actuators in a step, minus the joint angles before it."""
-    state = jax.jit(jax.vmap(go1.reset))(jax.random.split(jax.random.key(0), 1))
-    action = jnp.linspace(-2, 2, A)[None]
-    angles = jax.vmap(go1.motion)(state.physics).joint_pos
-    x = jnp.concatenate([jnp.full((1, 6), 9.0), angles, jnp.full((1, A), 9.0)], 1)
-    jax.block_until_ready(jax.jit(jax.vmap(go1.step))(state, action))
-    told = np.array(go1.engine.batch(1).bind("ctrl")).ravel()
-    np.testing.assert_allclose(script.commanded_change(go1, x, action)[0], told - state.physics.qpos[0, 7:], atol=1e-5)
+    """The joint targets of an action, minus the joint angles; test_envs.py ties the targets to the engine."""
+    like = jax.eval_shape(go1.reset, jax.random.key(0)).replace(key=None)
+    state = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), like)
+    action, angles = (np.linspace(-most, most, A, dtype=np.float32) for most in (2, 1))
+    x = np.concatenate([np.full(6, 9.0), angles, np.full(A, 9.0)])
+    moved = np.asarray(go1.joint_targets(state, action)) - (angles + np.array(go1.robot.default_pose))
+    np.testing.assert_allclose(script.commanded_change(go1, x, action), moved, atol=1e-5)
 
 
 def test_errors_on_made_up_predictions(go1, dataset):

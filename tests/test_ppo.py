@@ -36,21 +36,6 @@ def test_gae_by_hand():
     np.testing.assert_allclose(ret[:, 0], [5.30272, 5.726, 4.8], rtol=1e-6)
 
 
-def test_gae_matches_a_loop():
-    rng = np.random.default_rng(0)
-    reward, value, last = rng.normal(size=(7, 3)), rng.normal(size=(7, 3)), rng.normal(size=3)
-    done = (rng.random((7, 3)) < 0.3).astype(float)
-    want = np.zeros((7, 3))
-    for n in range(3):
-        carry, following = 0.0, last[n]
-        for t in reversed(range(7)):
-            alive = 1 - done[t, n]
-            carry = reward[t, n] + 0.9 * following * alive - value[t, n] + 0.9 * 0.8 * alive * carry
-            want[t, n], following = carry, value[t, n]
-    got, _ = script.gae(ARGS, *map(jnp.asarray, (reward, done, value, last)))
-    np.testing.assert_allclose(got, want, rtol=1e-5, atol=1e-6)
-
-
 def test_termination_cuts_the_advantage():
     """Steps after the end of an episode do not change the advantages before it."""
     value, done = jnp.ones((3, 1)), jnp.array([[0.0], [1.0], [0.0]])

@@ -16,7 +16,7 @@ import pytest
 import ppo_explore
 import ppo_finetune
 import pretrain_pidm
-from experiment import devices
+from experiment import devices, run
 
 T, N, M, K = 8, 6, 4, 2  # rollout steps, environments, minibatches, history
 OBS, X, A = 7, 10, 3  # observation, proprioception, action
@@ -425,6 +425,31 @@ def test_iteration_of_stage_three(network, piece, monkeypatch):
         old, new = (tree["params"][part][module] for tree in (float64(params), want.params))
         compare(report[name], np.mean([np.abs(new[i]["kernel"] - old[i]["kernel"]).mean() for i in new]))
     assert after.iteration == 6 and int(after.env.clock[0]) == T
+
+
+class FoundError(Exception):
+    pass
+
+
+@pytest.mark.parametrize(
+    ("script", "more", "sizes"),
+    [(ppo_finetune, {}, {"opt": 1.0}), (ppo_explore, {"ensemble_lr": 0.25}, {"opt": 1.0, "member_opt": -0.25})],
+)
+def test_trainings_have_the_adam_of_the_reference(script, more, sizes, tmp_path, monkeypatch):
+    """The scripts' own optimisers, on gradients so small that epsilon shows."""
+
+    def start(self, init):
+        raise FoundError(init.keywords)
+
+    monkeypatch.setattr(run.Run, "start", start)
+    with pytest.raises(FoundError) as found:
+        script.main(script.Args(preset="smoke", run_dir=str(tmp_path), **more))
+    (parts,) = found.value.args
+    for name, size in sizes.items():
+        adam, state = Adam({"w": np.zeros(2)}), parts[name].init({"w": jnp.zeros(2)})
+        for gradient in ([3e-8, -2.0], [-1e-8, 0.5]):
+            step, state = parts[name].update({"w": jnp.array(gradient)}, state)
+            compare(step["w"], size * adam.step({"w": np.array(gradient)})["w"], rtol=1e-4)
 
 
 # --- Stage 1 ---

@@ -1,6 +1,7 @@
 """A training that breaks keeps its last good state, from which replay.py finds the robots that failed."""
 
 import csv
+from types import SimpleNamespace
 
 import jax
 import numpy as np
@@ -22,10 +23,8 @@ def run(tmp_path_factory):
 
 
 def test_a_robot_that_fails_is_found_and_dumped(run, capsys):
-    """One of four environments is shot into the sky, after a look at the sound run."""
+    """One of four environments is shot into the sky."""
     out, state = run
-    replay.main(replay.Args(str(out), iterations=1))
-    assert "nothing failed from iteration 4 to 4" in capsys.readouterr().out and not (out / "nan.npz").exists()
     qvel = state.env.physics.qvel.at[2, 2].set(2000.0)
     broken = state.replace(env=state.env.replace(physics=state.env.physics.replace(qvel=qvel)))
     records.save_state(out, broken, [])
@@ -40,18 +39,18 @@ def test_a_robot_that_fails_is_found_and_dumped(run, capsys):
     assert "environment 2: " in out and out.count("physics step") == 5, "it has the config of the run"
 
 
-def test_targets_of_a_dump_are_those_of_the_delayed_actions():
+def test_targets_of_a_dump_are_those_of_the_delayed_actions(monkeypatch):
     """All robots act one control step late: the second target is that of the first action."""
     args = ppo_finetune.Args(preset="smoke", engine="c", set=("action_delay=0.02,0.02",))
     env = envs.make(args.task, "c", action_delay=(0.02, 0.02))
     args = ppo_finetune.merge(args, env.config.ppo)
     net, opt = ppo_finetune.make_net(args, env), optax.scale_by_adam()
     state = ppo_finetune.init_state(args, env, net, opt)
+    given = jax.random.normal(jax.random.key(0), (3, 4, 12))
+    monkeypatch.setattr(ppo_finetune, "rollout", lambda *_: (None, (SimpleNamespace(action=given), None)))
     targets = jax.jit(lambda s: replay.trace(args, env, net, s))(state)[2]
-    k_roll, _ = jax.random.split(jax.random.fold_in(state.key, state.iteration))
-    roll = jax.jit(lambda s: ppo_finetune.rollout(args, env, net, s.params, s.env, k_roll))(state)[1][0]
     np.testing.assert_allclose(targets[0], np.tile(env.default_pose, (4, 1)))
-    np.testing.assert_allclose(targets[1], env.default_pose + env.action_scale * roll.action[0], atol=1e-6)
+    np.testing.assert_allclose(targets[1:], env.default_pose + env.action_scale * given[:-1], atol=1e-6)
 
 
 def test_weights_that_are_not_finite_stop_the_run_and_keep_the_last_good_state(tmp_path, refused, capsys):

@@ -85,6 +85,13 @@ def test_resumed_run_has_the_same_bits(script, whole, tmp_path, monkeypatch):
     jax.tree.map(np.testing.assert_array_equal, *(weights_of(folder / RESULT[script]) for folder in (want, broken)))
 
 
+def test_every_iteration_of_a_collection_is_stored(collection):
+    """50 of them in two chunks: gravity is a unit vector in every row, and no rollout comes twice."""
+    x = np.load(collection[0] / "x.npy")
+    np.testing.assert_allclose(np.linalg.norm(x[..., 3:6], axis=-1), 1.0, atol=1e-5)
+    assert len(x) == 50 == len(np.unique(x.reshape(50, -1), axis=0))
+
+
 def test_the_time_before_a_resume_counts(tmp_path):
     one = run.Run(ppo_finetune.Args(run_dir=str(tmp_path)), None, 10, ())
     one.rows = [[{"seconds": 100.0}]]

@@ -357,10 +357,11 @@ def test_every_kind_of_task_has_a_case():
 
 
 def test_a_failure_in_the_last_step_is_no_time_limit(jitted):
-    """One robot lies on its back, one stands, when their time is up: the return of the second alone goes on."""
+    """One robot lies on its back, others stand, when their time is up: their returns alone go on."""
     task = jitted("go1_loco")
-    state = task.start(2)
+    state = task.start(ROBOTS)
     qpos = state.physics.qpos.at[0, 2:7].set(jnp.array([0.05, 0, 1, 0, 0]))
-    state = state.replace(clock=jnp.full(2, task.env.episode_steps - 1), physics=state.physics.replace(qpos=qpos))
+    state = state.replace(clock=jnp.full(ROBOTS, task.env.episode_steps - 1), physics=state.physics.replace(qpos=qpos))
     after = task.hold(state)
-    assert after.terminated.tolist() == [True, False] and after.truncated.tolist() == [False, True]
+    assert after.terminated.tolist() == [True] + [False] * (ROBOTS - 1)
+    np.testing.assert_array_equal(after.truncated, ~after.terminated)

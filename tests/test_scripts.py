@@ -3,18 +3,22 @@
 import csv
 import dataclasses
 import json
+import shutil
 import signal
 import subprocess
-import sys
 from pathlib import Path
+from types import SimpleNamespace
 
+import flax
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import tyro
 
 import envs
 import play
+import ppo_explore
 import ppo_finetune as script
 from envs import render
 from experiment import gait, records
@@ -22,12 +26,6 @@ from experiment.progress import Progress
 
 ROOT = Path(__file__).resolve().parent.parent
 SMOKE = script.Args(preset="smoke")
-
-
-def run(*arguments, **kwargs):
-    """A script with its arguments in a process of its own. Returns the finished process."""
-    command = [sys.executable, *map(str, arguments)]
-    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=900, check=False, **kwargs)
 
 
 @pytest.fixture(scope="module")
@@ -69,7 +67,13 @@ def test_same_seed_same_weights(trained, tmp_path):
     assert not np.array_equal(*kernels)
 
 
-def test_seeds_whose_folder_is_taken_are_refused_together(trained, tmp_path, refused):
+@pytest.fixture
+def no_state(monkeypatch):
+    """For what is refused after the first state was made, whatever it is."""
+    monkeypatch.setattr(script, "init_state", lambda args, **_: jnp.zeros(1))
+
+
+def test_seeds_whose_folder_is_taken_are_refused_together(no_state, tmp_path, refused):
     (tmp_path / "seed1").mkdir()
     (tmp_path / "seed1/metrics.csv").write_text("old\n")
     refused(script.main, dataclasses.replace(SMOKE, num_seeds=2, run_dir=str(tmp_path)), "seed1 holds a run")
@@ -121,6 +125,89 @@ def test_first_clocks_are_spread(fresh):
     env, _, state = fresh
     clocks = np.asarray(state.env.clock)
     assert clocks.min() < 200 and clocks.max() > 800 and clocks.max() < env.episode_steps
+    gaps = np.asarray(state.env.push_at) - clocks
+    assert gaps.min() >= 500 and gaps.max() <= 750, "nobody is pushed at once"
+
+
+ENDS = np.array([[0, 1, 0, 1], [0, 0, 2, 1], [0, 0, 0, 2]])  # robot, step -> 1: a fall, 2: the time limit
+
+
+@flax.struct.dataclass
+class Pose:
+    qpos: jax.Array
+
+
+@flax.struct.dataclass
+class Played:
+    """What `evaluate` reads of a State, and what ends its episodes."""
+
+    obs: jax.Array
+    history: dict
+    terminated: jax.Array
+    truncated: jax.Array
+    physics: Pose
+    metrics: dict
+    number: jax.Array
+    clock: jax.Array
+    level: jax.Array
+
+
+class Theatre:
+    """Robots whose episodes end as ENDS says; qpos is the clock."""
+
+    episode_steps = 4
+
+    def at_level(self, level):
+        return {"level": level}
+
+    def reset(self, key, curriculum=None):
+        known = jax.random.key_data(jax.random.split(jax.random.key(1), len(ENDS)))
+        number = jnp.argmax((known == jax.random.key_data(key)).all(-1))
+        level = jnp.float32(-1 if curriculum is None else curriculum["level"])
+        return self.state(number, jnp.int32(0), level, jnp.int32(0))
+
+    def state(self, number, clock, level, end):
+        metrics = {"level": level, "steps": clock.astype(float), "episode_return": clock + jnp.float32(100) * number}
+        pose = Pose(clock[None].astype(float))
+        return Played(jnp.zeros(1), {}, end == 1, end == 2, pose, metrics, number, clock, level)
+
+    def step(self, state, action):
+        end = jnp.asarray(ENDS, jnp.int32)[state.number, state.clock]
+        return self.state(state.number, state.clock + 1, state.level, end)
+
+
+def test_an_evaluation_is_of_first_episodes_at_its_level():
+    """They last 2, 3 and 4 steps; one of three is a fall, and what follows an episode counts for nothing."""
+    net = SimpleNamespace(inputs=lambda obs, _: obs, apply=lambda _, obs, method: obs, mean=None)
+    result, _, qpos = play.evaluate(Theatre(), net, None, 3, 7)
+    want = {"level": 7, "steps": 19 / 9, "episode_return": 103, "falls": 1 / 3}
+    assert {name: float(x) for name, x in result.items()} == pytest.approx(want)
+    assert qpos.ravel().tolist() == [1.0] * 4, "the pose before the step that ended it"
+    assert play.evaluate(Theatre(), net, None, 3)[0]["level"] == -1
+
+
+@pytest.mark.parametrize("level", [None, 7])
+def test_courses_are_evaluated_level_by_level(level, tmp_path, monkeypatch):
+    """On no rough tiles; the picture is of the level asked for, else of level 4."""
+    seen = []
+
+    def evaluate(env, net, params, episodes, level=None):
+        seen.append(env.config)
+        like = jax.eval_shape(env.reset, jax.random.key(0)).replace(key=None)
+        start = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), like)
+        return {"at": -1.0 if level is None else level}, start, jnp.zeros((3, env.engine.model.nq))
+
+    monkeypatch.setattr(play, "evaluate", evaluate)
+    monkeypatch.setattr(render, "film", lambda *_, **words: {"title.txt": words["title"].encode()})
+    policy = shutil.copy(ROOT / "results/tasks/anymal_jump/policy.msgpack", tmp_path)
+    play.main(play.Args(str(policy), level=level))
+    report = json.loads((tmp_path / "eval.json").read_text())
+    got = {name: x["at"] for name, x in report.items() if name.startswith("level")}
+    assert got == {f"level {i}": i for i in (range(10) if level is None else [level])}
+    *tested, shown = seen
+    assert {c.rough for c in seen} == {0} and {c.level for c in tested} == {None}
+    assert shown.level == (4 if level is None else level) and shown.random_seconds == 0
+    assert (tmp_path / "title.txt").read_text() == f"level {shown.level}, MLP"
 
 
 def test_play_prints_and_draws(trained, capsys):
@@ -196,6 +283,7 @@ def test_set_reaches_the_environment_and_the_records(tmp_path, monkeypatch):
         (["friction=abc"], "friction takes two numbers like 0.3,1.2, not 'abc'"),
         (["weights.glide=1"], "unknown option 'weights.glide'; choose one of weights."),
         (["ppo={}"], "ppo cannot be set"),
+        (["robot=h1.xml"], "robot cannot be set: it belongs to the task"),
         (["robust=false"], "robust cannot be set: --robust turns it on as a whole"),
         (["friction"], "--set takes NAME=VALUE, not 'friction'"),
         (["noise=0.5", "push_seconds=inf,inf"], "push_seconds takes two numbers"),
@@ -206,10 +294,10 @@ def test_what_cannot_be_set_is_refused(words, said, tmp_path, refused):
     assert not (tmp_path / "run").exists()
 
 
-def test_set_from_the_command_line():
-    """In a process of its own, with several values behind one flag; what a user sees of a refusal."""
-    process = run("ppo_explore.py", "--preset", "smoke", "--set", "noise=0.5", "push_axes=3", "friction=0.3,1.2")
-    assert process.returncode == 2 and process.stderr == "error: push_axes takes 2 or 6, not '3'\n", process.stderr
+def test_set_from_the_command_line(refused):
+    """Several values behind one flag."""
+    words = ["--preset", "smoke", "--set", "noise=0.5", "push_axes=3", "friction=0.3,1.2"]
+    refused(ppo_explore.main, tyro.cli(ppo_explore.Args, args=words), "push_axes takes 2 or 6, not '3'")
 
 
 # --- Faults ---
@@ -254,7 +342,7 @@ def test_out_of_memory_names_what_to_lower(tmp_path, refused, monkeypatch):
     refused(script.main, args, "out of memory", "--num-envs", "allocating 99 bytes")
 
 
-def test_a_run_is_not_overwritten(trained, refused):
+def test_a_run_is_not_overwritten(trained, no_state, refused):
     before = (trained[0] / "metrics.csv").read_bytes()
     refused(script.main, dataclasses.replace(SMOKE, run_dir=str(trained[0])), "holds a run", "--force")
     assert (trained[0] / "metrics.csv").read_bytes() == before

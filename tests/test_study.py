@@ -24,7 +24,9 @@ def runs(tmp_path, monkeypatch):
     monkeypatch.setattr(study, "ROOT", tmp_path)
     calls = []
 
-    def finetune(words, log, seconds):
+    def run_script(words, log, seconds):
+        script, *words = words
+        assert script == "ppo_finetune.py"
         calls.append(words)
         folder = tmp_path / (words[-1] if words[0] == "--resume" else words[-2])
         interrupted = len(calls) == 1
@@ -38,7 +40,7 @@ def runs(tmp_path, monkeypatch):
         for name in names:
             (folder / name).touch()
 
-    monkeypatch.setattr(study.recording, "finetune", finetune)
+    monkeypatch.setattr(study.recording, "run_script", run_script)
     monkeypatch.setattr(study.recording, "evaluate", evaluate)
     monkeypatch.setattr(study.Cell, "lacks", lambda cell: None)
     return calls
@@ -80,7 +82,7 @@ def test_what_cannot_be_trained_yet_is_left_out(runs, monkeypatch, capsys):
 
 def test_a_training_that_was_asked_to_stop_is_not_kept(runs, monkeypatch):
     """It ends well, but without all of its steps."""
-    monkeypatch.setattr(study.recording, "finetune", lambda *words: True)
+    monkeypatch.setattr(study.recording, "run_script", lambda *words: True)
     cell = study.Cell("batch", "go1_loco", "mlp", 2)
     folder = study.ROOT / "runs" / cell.folder
     folder.mkdir(parents=True)

@@ -1,8 +1,13 @@
 """Weights, floors and thresholds of every task against numbers copied by hand from its source."""
 
+import json
+from pathlib import Path
+
 import pytest
 
 import envs
+
+ROOT = Path(__file__).resolve().parent.parent
 
 # Reward weights: term -> that of the source, or that and ours where ours differs (None: not a term there, or here).
 SOURCES = {
@@ -146,6 +151,13 @@ def test_robust_sets_add_to_the_weights_of_their_task():
     assert ROBUST.keys() >= {"anymal_loco", "go1_loco"}
     for task, weights in ROBUST.items():
         assert CONFIGS[task].weights.keys() <= weights.keys()
+
+
+@pytest.mark.parametrize("task", ROBUST)
+def test_robust_sets_are_those_of_the_recorded_policies(task):
+    name = CONFIGS[task].robot.removesuffix("_d")
+    record = json.loads((ROOT / f"results/tasks/{name}_robust/args.json").read_text())
+    assert record["config"]["robust"] == json.loads(json.dumps(CONFIGS[task].robust))
 
 
 def test_thresholds():

@@ -307,9 +307,12 @@ def test_arguments_beside_resume_are_refused_even_at_their_default(usual, monkey
 @pytest.fixture
 def untrained(usual, monkeypatch):
     """play.Args of a policy whose evaluation and pictures cost nothing."""
-    monkeypatch.setattr(
-        play, "evaluate", lambda env, *_: ({}, env.reset(jax.random.key(0)), np.zeros((4, env.engine.model.nq)))
-    )
+
+    def evaluate(env, *_):
+        like = jax.eval_shape(env.reset, jax.random.key(0)).replace(key=None)
+        return {}, jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), like), np.zeros((4, env.engine.model.nq))
+
+    monkeypatch.setattr(play, "evaluate", evaluate)
     monkeypatch.setattr(render, "video", lambda *_: b"film")
     converter, helper = types.ModuleType("jax2onnx"), types.SimpleNamespace(set_model_props=lambda *_: None)
     converter.to_onnx = lambda *_, **__: types.SimpleNamespace(SerializeToString=lambda: b"graph")
@@ -371,7 +374,8 @@ def test_a_reader_that_has_gone_is_no_error(monkeypatch, capsys):
     assert stop.value.code == 1 and not capsys.readouterr().err
 
 
-def test_a_run_folder_that_is_a_file_is_refused(tmp_path, refused):
+def test_a_run_folder_that_is_a_file_is_refused(tmp_path, refused, monkeypatch):
+    monkeypatch.setattr(script, "init_state", lambda args, **_: np.zeros(1))
     (tmp_path / "run").touch()
     refused(script.main, dataclasses.replace(SMOKE, run_dir=str(tmp_path / "run")), "cannot write to", "run: ")
 
@@ -389,7 +393,8 @@ def test_matplotlib_takes_nothing_from_its_surroundings(usual):
 
 
 @needs_locks
-def test_a_second_process_in_the_same_folder_is_refused(usual, tmp_path, refused):
+def test_a_second_process_in_the_same_folder_is_refused(usual, tmp_path, refused, monkeypatch):
+    monkeypatch.setattr(script, "init_state", lambda args, **_: np.zeros(1))
     out, new = tmp_path / "run", tmp_path / "new"
     shutil.copytree(usual, out)
     new.mkdir()

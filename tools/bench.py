@@ -16,7 +16,6 @@ A part that is measured again replaces its older figures. Each figure comes from
 """
 
 import copy
-import csv
 import itertools
 import json
 import os
@@ -42,7 +41,6 @@ import tyro
 
 import envs
 from envs.engine import (
-    cpu_count,
     mujoco,  # envs comes first: it takes MUJOCO_GL out of the way
 )
 from experiment import devices, records
@@ -99,10 +97,9 @@ def memory():
     return stats["peak_bytes_in_use"] / 2**20 if "peak_bytes_in_use" in stats else kib / 1024
 
 
-def training(task, num_envs=None, hidden=None, num_seeds=1, extra=(), iterations=20):
+def training(task, num_envs=512, hidden=None, num_seeds=1, extra=(), iterations=20):
     """Steps per second of ppo_finetune.py after its first row, compile time, and time from start to that row."""
     ppo = envs.TASKS[task][1].ppo["cpu"]
-    num_envs = num_envs or 512
     steps = num_envs * ppo.get("num_steps", 24)
     with tempfile.TemporaryDirectory() as folder:
         words = ["--task", task, "--num-envs", num_envs, "--run-dir", folder, "--force", "--num-seeds", num_seeds]
@@ -116,9 +113,7 @@ def training(task, num_envs=None, hidden=None, num_seeds=1, extra=(), iterations
                 if " steps " in text and to_first is None:
                     to_first = time.perf_counter() - start
         path = Path(folder, "metrics.csv") if num_seeds == 1 else Path(folder, "seed0/metrics.csv")
-        with path.open() as file:
-            rows = list(csv.DictReader(file))
-        count, seconds = ([float(row[name]) for row in rows] for name in ("env_steps", "seconds"))
+        count, seconds = ([row[name] for row in records.read_rows(path)] for name in ("env_steps", "seconds"))
         speed = num_seeds * (count[-1] - count[0]) / (seconds[-1] - seconds[0])
         return {"envs": num_envs, "steps/s": speed, "compile s": compile_s, "start to first row s": to_first}
 
@@ -240,20 +235,6 @@ def cpu_name():
     return names[0] if names else platform.processor() or platform.machine()
 
 
-def machine():
-    """Machine and versions that the figures were measured with."""
-    git = subprocess.run(["git", "describe", "--always", "--dirty"], cwd=ROOT, capture_output=True, text=True)
-    return {
-        "cpu": cpu_name(),
-        "cores": cpu_count(),
-        "device": jax.devices()[0].device_kind,
-        "python": platform.python_version(),
-        "jax": jax.__version__,
-        "mujoco": mujoco.__version__,
-        "commit": git.stdout.strip(),
-    }
-
-
 def as_text(value):
     """A number, or numbers, as in the tables."""
     if isinstance(value, float):
@@ -291,11 +272,10 @@ def main(args):
     if "peers" in args.parts and not (args.peers and Path(args.peers).exists()):
         raise records.UserError("part peers needs --peers PYTHON, of an environment as in tools/peers.py")
     folder = ROOT / "results/bench"
-    folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{args.machine}.json"
     known = json.loads(path.read_text()) if path.exists() else {}
     for part in args.parts:
-        here, rows = machine(), []
+        here, rows = {"cpu": cpu_name()} | records.versions(), []
         print(part, here)
         for row in ROWS[part](args):
             rows.append(row)
@@ -303,7 +283,7 @@ def main(args):
         if part == "peers":
             print(table(with_ratios(rows)))
         known[f"{part} {args.label}".strip()] = {"machine": here, "rows": rows}
-        records.replace_text(path, json.dumps(known, indent=1) + "\n")
+        records.write(path, (json.dumps(known, indent=1) + "\n").encode())
     return write_page(folder)
 
 

@@ -7,7 +7,6 @@ Prints what envs/loader.py derived, five checks and what it would change. Draws 
 the robot falls over, diverges or is no mirror image of itself where it should be.
 """
 
-import io
 import sys
 import time
 from dataclasses import dataclass
@@ -18,7 +17,6 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import tyro
-from PIL import Image
 
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
@@ -136,13 +134,7 @@ def picture(robot, body):
     spec = terrain.flat_scene(robot, visual=True)
     half = np.deg2rad([0, 90, 180, 270]) / 2 + np.deg2rad(15)
     poses = [[0, 0, body["height"], np.cos(a), 0, 0, np.sin(a), *robot.default_pose] for a in half]
-    images = render.draw(spec, np.array(poses))
-    sheet = Image.new("RGB", (2 * render.WIDTH, 2 * render.HEIGHT))
-    for i, image in enumerate(images):
-        sheet.paste(image, (i % 2 * render.WIDTH, i // 2 * render.HEIGHT))
-    png = io.BytesIO()
-    sheet.save(png, "PNG", optimize=True)
-    return png.getvalue()
+    return render.sheet(render.draw(spec, np.array(poses)), 2)
 
 
 def advice(body, stood, mirrors):

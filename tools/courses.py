@@ -5,7 +5,6 @@
 Writes results/courses.png.
 """
 
-import io
 import sys
 from pathlib import Path
 
@@ -13,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import tyro
-from PIL import Image, ImageDraw
+from PIL import ImageDraw
 
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
@@ -37,7 +36,7 @@ def picture(env, level, key):
     motion, task = env.motion(state.physics), state.task.replace(shift=jnp.zeros(3))
     spec = render.build(env, state.physics)
     xy = env.grid(parkour.HEIGHT_GRID, motion, task)
-    ground = env.heights(motion.mocap_pos, motion.mocap_quat, xy)
+    ground = env.ground_height(motion, xy)
     dots(spec, jnp.concatenate([xy, ground[:, None]], -1), [0.9, 0.2, 0.1, 1])
     if env.overhead.any():
         xy = env.grid(parkour.CEILING_GRID, motion, task)
@@ -50,16 +49,13 @@ def picture(env, level, key):
 def main():
     devices.find()
     tasks = [task for task, (family, _) in envs.TASKS.items() if family is parkour.Parkour]
-    sheet = Image.new("RGB", (render.WIDTH * len(LEVELS), render.HEIGHT * len(tasks)), "white")
-    for row, task in enumerate(tasks):
+    images = []
+    for task in tasks:
         env = envs.make(task, "c", noise=0.0, rough=0.0)
-        for column, level in enumerate(LEVELS):
-            image = picture(env, level, jax.random.key(3))
-            ImageDraw.Draw(image).text((6, 4), f"{task}, level {level}", fill=(20, 20, 20))
-            sheet.paste(image, (column * render.WIDTH, row * render.HEIGHT))
-    file = io.BytesIO()
-    sheet.save(file, "PNG", optimize=True)
-    records.replace_bytes(ROOT / "results/courses.png", file.getvalue())
+        for level in LEVELS:
+            images.append(picture(env, level, jax.random.key(3)))
+            ImageDraw.Draw(images[-1]).text((6, 4), f"{task}, level {level}", fill=(20, 20, 20))
+    records.replace_bytes(ROOT / "results/courses.png", render.sheet(images, len(LEVELS)))
     print("wrote results/courses.png")
 
 

@@ -22,7 +22,7 @@ sys.path.insert(0, str(ROOT))
 
 import play
 from envs.locomotion import LocomotionConfig
-from envs.rotations import axis_angle, inverse, rotate, yaw_of
+from envs.rotations import in_heading, inverse, rotate, yaw_of
 from experiment import gait, records
 
 NOMINAL = {  # the task without what makes a training robust; starts still differ
@@ -40,7 +40,6 @@ NOMINAL = {  # the task without what makes a training robust; starts still diffe
 DELAY, PUSH, SLIPPERY = 0.04, 1.0, 0.3  # [s], [m/s], coefficient of friction
 LOAD, SHARE = 3.0, 0.25  # [kg], of the robot's mass, whichever is less
 PUSH_AT = 0.4  # of an episode
-TESTED = "forward 0.8"  # command of the tests of robustness
 
 
 @dataclass(frozen=True)
@@ -52,7 +51,7 @@ class Args:
     json: str | None = None  # also write the numbers to this file
     starts: int = 20  # episodes of a command; tests of robustness have twice as many
     seconds: float = 10.0  # of an episode
-    engine: str = "c"  # physics: c, mjx, warp
+    engine: str = "auto"  # physics: c, mjx, warp
 
 
 # --- Motion ---
@@ -95,10 +94,10 @@ def drive(env, net, params, state, commands, kicks):
 
 def observed(env, state, action):
     """Fields of gait.Recording of one robot, and whether it fell."""
-    p, heading = state.physics, axis_angle(jnp.array([0.0, 0, 1]), yaw_of(state.physics.qpos[3:7]))
+    p, yaw = state.physics, yaw_of(state.physics.qpos[3:7])
     up = rotate(inverse(p.qpos[3:7]), jnp.array([0.0, 0, 1]))
     return {
-        "lin_vel": rotate(inverse(heading), p.qvel[:3]),
+        "lin_vel": in_heading(yaw, p.qvel[:3]),
         "yaw_rate": rotate(p.qpos[3:7], p.qvel[3:6])[2],
         "height": p.qpos[2],
         "roll": jnp.arctan2(up[1], up[2]),
@@ -156,20 +155,23 @@ def evaluate(args):
     commands = {
         name: gait.schedule(name, env.dt, args.starts, args.seconds) for name in (*gait.COMMANDS, *gait.SEQUENCES)
     }
-    tested = gait.schedule(TESTED, env.dt, 2 * args.starts, args.seconds)
+    tested = gait.schedule(gait.USUAL, env.dt, 2 * args.starts, args.seconds)
     added = min(LOAD, round(SHARE * facts.mass, 2))
+    late, known = f"delay of {1000 * DELAY:.0f} ms", (env.config.history - 1) * env.dt  # [s] of past actions
     changes = {
-        f"delay of {1000 * DELAY:.0f} ms": {"delay": DELAY},
+        late: {"delay": DELAY},
         f"push of {PUSH} m/s": {"kicks": pushes(steps, 2 * args.starts)},
         f"{added:g} kg more": {"load": added},
         f"friction {SLIPPERY}": {"friction": SLIPPERY},
     }
+    if env.config.action_delay[1] + DELAY > known + 1e-9:
+        del changes[late]
     motions = run(env, net, params, commands | dict.fromkeys(changes, tested), changes)
     warm_up = gait.WARM_UP * args.seconds / gait.SECONDS
     by_command = {name: gait.measure(motions[name], facts, warm_up) for name in commands}
     by_command["reverse"]["reversed"] = gait.reversals(motions["reverse"])
     fell = {name: (float(gait.fallen(motions[name]).sum()), 2.0 * args.starts) for name in changes}
-    return by_command, gait.summary(by_command, fell)
+    return by_command, gait.summary(by_command, dict.fromkeys((late,)) | fell)
 
 
 def main(args):

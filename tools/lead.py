@@ -21,7 +21,7 @@ sys.path.insert(0, str(ROOT))
 import envs
 import play
 from envs import render, terrain
-from experiment import devices, records
+from experiment import records
 
 # task -> robot's name, first instant [s], number of instants, least distance between them [m], robot's height [m]
 ROWS = {
@@ -100,7 +100,6 @@ def row(task, name, start, count, gap, tall):
 
 
 def main():
-    devices.find()
     images = [row(task, *about) for task, about in ROWS.items()]
     sheet = Image.new("RGB", (WIDTH, sum(image.height + BETWEEN for image in images) - BETWEEN), "white")
     top = 0

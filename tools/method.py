@@ -5,7 +5,6 @@
 Writes docs/method.png. Lengths are pixels of the picture, from its lower left corner.
 """
 
-import io
 import sys
 from pathlib import Path
 
@@ -19,7 +18,7 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 
 import envs
-from experiment import devices, records
+from experiment import devices, figures, records
 
 WIDTH, HEIGHT = 1600, 840
 TEXT = 24  # 9 points where the picture is shown 800 pixels wide
@@ -180,9 +179,7 @@ def main():
     handover(ax, 435, 224, "#8A939C")
     handover(ax, 915, BACKBONE, CORE)
     legend(ax)
-    file = io.BytesIO()
-    fig.savefig(file, format="png", metadata={"Software": None})
-    records.replace_bytes(ROOT / "docs/method.png", file.getvalue())
+    figures.save(fig, ROOT / "docs/method.png", dpi=72)
     print("wrote docs/method.png")
 
 

@@ -22,7 +22,6 @@ import numpy as np
 import tyro
 
 ROOT = Path(__file__).resolve().parent.parent
-LIMIT = np.ones(3)  # of the command: m/s, m/s, rad/s
 
 
 # >>> copy: keys (owner: tools/play_onnx.py)
@@ -66,6 +65,8 @@ class Player:
         facts = self.session.get_modelmeta().custom_metadata_map
         self.facts = {name: json.loads(value) for name, value in facts.items()}
         self.pose = np.array(self.facts["default_pose"])
+        trained = self.facts.get("command_ranges", dict.fromkeys("xyz", (-1.0, 1.0)))  # older files do not say
+        self.low, self.high = np.array([*trained.values()]).T  # of the command: m/s, m/s, rad/s
         self.shapes = {given.name: given.shape for given in self.session.get_inputs()}
         spec = self.spec()
         plane = mujoco.mjtGeom.mjGEOM_PLANE
@@ -152,7 +153,7 @@ def watch(player, command):
     wanted = np.array(command, float)
 
     def press(key):
-        wanted[:] = pressed(key, wanted, -LIMIT, LIMIT)
+        wanted[:] = pressed(key, wanted, player.low, player.high)
 
     try:
         opened = mujoco.viewer.launch_passive(player.model, player.data, key_callback=press)
@@ -199,6 +200,8 @@ def main(args):
     unknown = player.shapes.keys() - player.readings(args.command).keys() - {"prop_history", "action_history"}
     if unknown:
         fail(f"{args.policy} reads {', '.join(sorted(unknown))}, which only the environments of this project provide")
+    if "phase" in player.shapes and "gait_hz" not in player.facts:
+        fail(f"{args.policy} has a gait clock, but its metadata lack gait_hz; export it anew")
     if args.viewer:
         return watch(player, args.command)
     velocity, falls = walk(player, args.command, args.seconds)

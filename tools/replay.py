@@ -7,7 +7,7 @@ The first command repeats the training, bit for bit on engine c, up to the first
 finite or a simulation that diverged. nan.npz holds these environments up to that step: qpos, qvel (steps, environments,
 ...) before each control step, the joint targets `ctrl`, and the environments' numbers. If no robot failed, it was the
 update of the weights. The second command steps the dumped robots in plain MuJoCo, with the masses and the friction of
-their file: those of the episodes are not in the dump.
+their file and joints that do not rub: those of the episodes are not in the dump.
 """
 
 import io
@@ -39,7 +39,8 @@ class Args:
     robots: int = 8  # in the dump, at most
 
 
-DUMPED = ("qpos", "qvel", "ctrl", "mocap_pos", "mocap_quat")  # before a step; ctrl are the joint targets
+# before a step; ctrl are the joint targets, xfrc_applied the forces on bodies
+DUMPED = ("qpos", "qvel", "ctrl", "mocap_pos", "mocap_quat", "xfrc_applied")
 
 
 def trace(args, env, net, state):
@@ -51,8 +52,8 @@ def trace(args, env, net, state):
         after = jax.vmap(env.step)(before, action)
         sound = jnp.isfinite(after.reward) & jnp.isfinite(action).all(-1) & jnp.isfinite(after.final_obs).all(-1)
         physics, target = before.physics, jax.vmap(env.joint_targets)(before, action)
-        course = physics.mocap_pos, physics.mocap_quat
-        return after, (physics.qpos, physics.qvel, target, *course, ~sound | after.metrics["diverged"])
+        given = physics.mocap_pos, physics.mocap_quat, physics.wrench
+        return after, (physics.qpos, physics.qvel, target, *given, ~sound | after.metrics["diverged"])
 
     return jax.lax.scan(step, state.env, roll.action)[1]
 
@@ -102,6 +103,7 @@ def repeat(path):
             raise ValueError("its shapes are not those of its task")
     except Exception as error:  # numpy has no common class for what can be wrong with a file
         raise records.UserError(f"{path} is not a dump of tools/replay.py: {error}") from None
+    env.model.dof_frictionloss[:] = 0.0
     for i, number in enumerate(dump["environment"]):
         data = mujoco.MjData(env.model)
         for name in DUMPED:

@@ -28,7 +28,7 @@ from mujoco.batch import Batch
 
 from envs import reader
 from envs.anatomy import bottom
-from envs.base import NOISE
+from envs.base import DIVERGED, NOISE
 from envs.engine import cpu_count
 from envs.robots import ROBOTS
 from experiment import gait, records
@@ -39,7 +39,6 @@ HISTORY = ("prop_history", "action_history")
 UPRIGHT = np.cos(np.deg2rad(60.0))  # of the base's tilt; less is a fall
 LOW = 0.5  # of the standing height; a lower base is a fall
 CONTACT = 1.0  # [N] more at the base is a fall
-DIVERGED = 1e3  # [m, m/s, rad/s] out of reach of any sound simulation
 GEOM, SENSOR = mujoco.mjtGeom, mujoco.mjtSensor
 JOINT, FREE = mujoco.mjtObj.mjOBJ_JOINT, mujoco.mjtJoint.mjJNT_FREE
 
@@ -115,7 +114,7 @@ def isolate(path, spec, names):
     for joint in base.find_all(JOINT):
         if joint.name not in names and joint.type != FREE:
             spec.delete(joint)
-    base = reader.base_of(path, spec, [])
+    base = reader.free_the_base(path, spec, [])
     reader.strip(path, spec, {reader.mesh_name(mesh) for mesh in spec.meshes})
     for i, geom in enumerate(spec.geoms):
         geom.name = geom.name or f"geom {i}"
@@ -467,7 +466,8 @@ def starts(robot, count, rng):
 
 def fell(qpos, qvel, base_force, height):
     """True (N,) for robots that tilt too far, are too low, touch the ground with the base, or have diverged."""
-    sound = (np.abs(qpos) < DIVERGED).all(1) & (np.abs(qvel) < DIVERGED).all(1)  # NaN is not
+    bounded = np.concatenate([qpos[:, 2:], qvel], 1)  # a long walk may lead anywhere
+    sound = (np.abs(bounded) < DIVERGED).all(1) & np.isfinite(qpos).all(1)
     upright = turns(np.where(sound[:, None], qpos, 1.0))[:, 2, 2] > UPRIGHT
     return ~(sound & upright & (qpos[:, 2] > LOW * height) & ~(np.linalg.norm(base_force, axis=1) > CONTACT))
 
