@@ -214,7 +214,9 @@ def start_runs(each, config):
         try:
             folder.mkdir(parents=True, exist_ok=True)
             claim(folder)
-            for old in (*(folder / name for name in (STATE, *RESULTS)), *folder.glob("events.out.tfevents.*")):
+            boards = (folder, folder.parent) if len(each) > 1 else (folder,)  # several seeds share one
+            events = [path for board in boards for path in board.glob("events.out.tfevents.*")]
+            for old in (*(folder / name for name in (STATE, *RESULTS)), *events):
                 old.unlink(missing_ok=True)
         except OSError as error:
             raise UserError(f"cannot write to {folder}: {error.strerror}") from None

@@ -363,6 +363,13 @@ def test_force_takes_the_old_results_away(tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["args.json", "mine.txt"]
 
 
+def test_several_seeds_share_the_board_above_them(tmp_path):
+    (tmp_path / "events.out.tfevents.1").touch()
+    seeds = [dataclasses.replace(SMOKE, run_dir=str(tmp_path / f"seed{seed}")) for seed in range(2)]
+    records.start_runs(seeds, SMOKE)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["seed0", "seed1"]
+
+
 @pytest.mark.parametrize("name", [*records.RESULTS, "meta.json"])
 def test_any_result_makes_a_folder_a_run(name, tmp_path):
     """Weights alone, say of somebody else's training, are not overwritten either."""
