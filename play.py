@@ -68,7 +68,8 @@ def load(args, kind="EVALUATION_FIELDS", **fields):
     _, meta = records.load(Path(args.policy), "policy")
     family = envs.family(meta["task"])
     if family is None:
-        raise records.UserError(f"{args.policy} is a policy for {meta['task']!r}; known are {', '.join(envs.TASKS)}")
+        known = ", ".join(envs.TASKS | envs.OWN | envs.GENERIC)
+        raise records.UserError(f"{args.policy} is a policy for {meta['task']!r}; known are {known}")
     if args.level is not None and not 0 <= args.level < family.LEVELS:
         known = f"choose 0 to {family.LEVELS - 1}" if family.LEVELS else "leave out --level"
         raise records.UserError(f"{meta['task']} has no level {args.level}; {known}")

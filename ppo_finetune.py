@@ -33,7 +33,7 @@ class Args:
     """A field left at None is filled in from the preset or the task. The merged set is printed and saved."""
 
     # --- Experiment ---
-    task: str = "go1_loco"  # a name in envs.TASKS, or loco with --robot
+    task: str = "go1_loco"  # a name in envs.TASKS or envs.OWN, or loco with --robot
     robot: str | None = None  # for --task loco: an MJCF, URDF or .toml file, or a run's args.json
     network: Literal["mlp", "pidm"] | None = None  # of actor and critic; None: pidm with --pretrained, else mlp
     pretrained: str | None = None  # PIDM checkpoint written by pretrain_pidm.py
@@ -85,7 +85,7 @@ PRESETS = {
     "cpu": {"num_envs": 256, "num_steps": 24, "log_every": 10},
     "gpu": {"num_envs": 4096, "num_steps": 24, "log_every": 10},
 }
-SHOWN = ("episode_return", "fall_rate", "lin_vel_error", "foot_error", "progress", "kl", "action_std")  # printed
+SHOWN = ("episode_return", "fall_rate", "lin_vel_error", "foot_error", "progress_reached", "kl", "action_std")
 
 
 def merge(args, ppo):

@@ -30,7 +30,7 @@ TASKS = {
     "anymal_crouch": (parkour.Parkour, parkour.CROUCH),
     "anymal_jump": (parkour.Parkour, parkour.JUMP),
 }
-OWN = {}  # tasks of your own, as in TASKS, of which tests and study know each by name
+OWN = {}  # tasks of your own, in the form of TASKS; tests and the study list every entry of TASKS by name
 GENERIC = {"loco": (locomotion.Locomotion, newcomers.loco)}  # tasks of a robot from a file
 
 
@@ -72,7 +72,7 @@ def make(task, engine="auto", /, robust=False, robot=None, **overrides):
     if not isinstance(robust, bool):  # text after --set robust=
         raise ValueError(f"robust cannot be set: {FIXED['robust']}")
     if robust and not config.robust:
-        known = ", ".join(name for name, (_, config) in TASKS.items() if config.robust)
+        known = ", ".join(name for name, (_, config) in (TASKS | OWN).items() if config.robust)
         raise ValueError(f"{task} has no robust set; {known} have one")
     config = replace_checked(config, config.robust if robust else {})
     return family(replace_checked(config, overrides), engine)

@@ -1,6 +1,6 @@
 """Feet, shanks and symmetries of a robot, found in its geometry; loader.py asks for them.
 
-All of it looks at the robot's own MjSpec, with the trunk upright in the origin.
+All of it looks at the robot's own MjSpec, with the trunk upright at the origin.
 Legend: A joints, F feet.
 """
 
@@ -31,7 +31,7 @@ def balls(shape):
 
 
 def posed(spec, pose=None):
-    """Model and data of a spec with the trunk upright in the origin, at these joint angles or those of the file."""
+    """Model and data of a spec with the trunk upright at the origin, at these joint angles or those of the file."""
     model = spec.compile()
     data = mujoco.MjData(model)  # at qpos0
     data.qpos[:7] = 0, 0, 0, 1, 0, 0, 0

@@ -304,7 +304,7 @@ class Env:
         task = self.before_rewards(state.task, motion)
         terms = self.rewards(task, motion, action, state.action, state.clock)
         if unknown := self.config.weights.keys() - terms.keys():
-            raise ValueError(f"no reward term {', '.join(unknown)}; this task has {', '.join(terms)}")
+            raise ValueError(f"no reward term {', '.join(sorted(unknown))}; this task has {', '.join(terms)}")
         terms = {
             name: jnp.asarray(weight * terms[name] * self.dt, jnp.float32)
             for name, weight in self.config.weights.items()

@@ -107,7 +107,7 @@ def replace_checked(config, overrides):
             raise ValueError(f"{name} cannot be set: {FIXED[name]}")
         if name not in kinds:
             choices = [other for other in kinds if name.startswith("weights.") == other.startswith("weights.")]
-            hint = " (a weight has to stand in the task's config first)" if name.startswith("weights.") else ""
+            hint = " (only weights that the task's config has can be set)" if name.startswith("weights.") else ""
             raise ValueError(f"unknown option {name!r}; choose one of {', '.join(sorted(choices))}{hint}")
         try:
             values[name] = (parse if isinstance(value, str) else convert)(value, kinds[name])

@@ -9,6 +9,7 @@ cold: joint targets have just jumped, so its last solution is no better a first 
 """
 
 import copy
+import functools
 import importlib.util
 import math
 import os
@@ -112,7 +113,8 @@ class Engine:
             if mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_SENSOR, name) < 0:
                 known = [self.model.sensor(i).name for i in range(self.model.nsensor)]
                 known = [other for other in known if other.endswith(f"_{name.rpartition('_')[2]}")]
-                raise ValueError(f"the robot's MJCF has no sensor {name!r}; it has {', '.join(known)}")
+                has = f"; it has {', '.join(known)}" if known else ""
+                raise ValueError(f"the robot's MJCF has no sensor {name!r}{has}")
         found = [self.model.sensor(name) for name in names]
         return np.array([np.arange(s.adr[0], s.adr[0] + s.dim[0]) for s in found]) if names else np.zeros((0, 3), int)
 
@@ -356,6 +358,11 @@ def one_batch(step_all):
 ENGINES = {"c": CEngine, "mjx": MjxEngine, "warp": WarpEngine}
 
 
+@functools.cache
+def say_once(text):
+    print(text)
+
+
 def best_engine():
     """Name of the default: c on a CPU, warp on one GPU where it is installed, else mjx."""
     if jax.default_backend() == "cpu":
@@ -364,7 +371,7 @@ def best_engine():
         return "mjx"
     if importlib.util.find_spec("warp"):
         return "warp"
-    print("engine mjx; the engine warp is many times as fast on this GPU: pip install -r requirements-gpu.txt")
+    say_once("using engine mjx; warp is many times as fast on an NVIDIA GPU: pip install -r requirements-gpu.txt")
     return "mjx"
 
 

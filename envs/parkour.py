@@ -155,7 +155,7 @@ class Parkour(Env):
         return xy, uniform(k_yaw, -c.spawn_yaw, c.spawn_yaw)
 
     def ground_height(self, course, xy):
-        """As in every task, also of a Motion or Physics, which know the slabs' places, too. Ceilings do not count."""
+        """Height of the ground [m] at xy (..., 2), without ceilings; a Motion or Physics has the slabs' poses, too."""
         ground = ~self.overhead
         pos, quat = course.mocap_pos[ground], course.mocap_quat[ground]
         return terrain.top_heights(pos, quat, self.half[ground], xy, self.skill.floor)

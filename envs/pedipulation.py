@@ -1,6 +1,6 @@
 """Pedipulation with ANYmal D: stand or walk on three legs while the right front foot tracks a point (Arm et al. 2024).
 
-The point is drawn from a box before the robot, which starts in the origin, and stays in the world for 6 s. The robot
+The point is drawn from a box before the robot, which starts at the origin, and stays in the world for 6 s. The robot
 has to walk to far points. It is always the same foot, so there is no symmetry and no mirror loss.
 """
 

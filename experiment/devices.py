@@ -58,7 +58,7 @@ def is_first():
 
 
 def any_process(asked):
-    """True if it is so in one of the processes: all of them have to stop in the same row."""
+    """True if any process asks to stop: all have to stop after the same row."""
     if jax.process_count() == 1:
         return asked
     from jax.experimental import multihost_utils

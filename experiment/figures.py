@@ -6,8 +6,8 @@ import numpy as np
 
 from experiment import records
 
-CURVES = ("episode_return", "disagreement", "ensemble_error", "ensemble_nll", "action_size", "fall_rate", "progress")
-CURVES += ("episode_success", "action_std")
+CURVES = ("episode_return", "disagreement", "ensemble_error", "ensemble_nll", "action_size", "fall_rate")
+CURVES += ("progress_reached", "episode_success", "action_std")
 
 
 def pyplot():

@@ -79,7 +79,7 @@ class Recording:
 def starts_of(name, starts):
     """Number of episodes of a command or sequence where most commands have `starts`.
 
-    The two arcs share them; more reverse, which is the harder test.
+    The two arcs share theirs; `reverse` gets a fifth more, since it is harder.
     """
     if name.startswith("arc"):
         return max(1, starts // 2)

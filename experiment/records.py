@@ -162,8 +162,8 @@ ABOVE_0 = ("lr", "max_lr", "ensemble_lr", "desired_kl", "init_std", "clip", "max
 def filled(args, values):
     """The arguments with fields that are None filled in from `values`; UserError unless all counts are at least 1.
 
-    Seeds are from 0 on and fit 32 bits: JAX ignores higher ones. Counts are below 1e12, as --resume wants them. Step
-    sizes and stds are above 0.
+    Seeds are at least 0 and fit into 32 bits, since JAX drops the bits above. Counts are below 1e12, as --resume wants
+    them. Step sizes and stds are above 0.
     """
     args = dataclasses.replace(args, **{name: v for name, v in values.items() if getattr(args, name) is None})
     for name, value in dataclasses.asdict(args).items():
@@ -271,6 +271,7 @@ RESULTS = (
     "rollout.gif",
     "nan.npz",
     "curve.png",
+    "beside_recorded.png",
     "accuracy.png",
     "distribution.png",
 )

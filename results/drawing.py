@@ -57,7 +57,7 @@ def legend_below(fig, axes, note, columns=4):
     fig.legend(entries.values(), entries.keys(), title=note, **place)
 
 
-SHADE = "thick: means over seeds; thin: up to three seeds; shaded: one standard deviation of more"
+SHADE = "thick: mean over seeds; thin: each seed, of up to three; shaded: ± one standard deviation, of four or more"
 
 
 def batch(runs):
@@ -70,6 +70,11 @@ def title(task, runs):
     """Title of a task, which says so if its runs were made before the task was changed."""
     earlier = any(run.get("earlier") for arm in runs.values() for run in arm)
     return TASKS.get(task, task) + " (earlier task)" * earlier
+
+
+def titled(task, runs):
+    """Title of a task with the batch of its runs."""
+    return f"{title(task, runs)}, {batch(runs)}"
 
 
 def draw_task(ax, heading, runs, methods, extra=None):
@@ -90,7 +95,7 @@ def draw_task(ax, heading, runs, methods, extra=None):
         ax.plot(*extra[1:], color="black", label=extra[0])
     parkour = "progress" in first["columns"]
     seeds_of = measures.seeds(runs, [method for method in methods if method in runs])
-    ax.set(title=f"{heading}, {batch(runs)} (n = {seeds_of})", xlabel="PPO iteration")
+    ax.set(title=f"{heading} (n = {seeds_of})", xlabel="PPO iteration")
     ax.set_ylim(bottom=0 if parkour else None)
     ax.set_ylabel("curriculum progress" if parkour else "episode return")
     per_iteration = first["columns"]["env_steps"][-1] / first["iteration"][-1] / 1e6
@@ -127,7 +132,7 @@ def draw_controls(study, path):
     fig, axes = panels(len(known), 2, 5.2, sharey="row")
     for row, (task, runs) in zip(axes, known.items(), strict=True):
         for ax, methods, weights in zip(row, (left, right), ("PyTorch's", "orthogonal"), strict=True):
-            draw_task(ax, title(task, runs), runs, [method for method in methods if method in runs])
+            draw_task(ax, titled(task, runs), runs, [method for method in methods if method in runs])
             ax.set_title(f"{ax.get_title()}\n{weights} weights", fontsize=10)
     legend_below(fig, axes.ravel(), SHADE, columns=3)
     figures.save(fig, path, dpi=80)
@@ -235,7 +240,7 @@ def by_scale(loaded, task):
 def curves_by_scale(loaded):
     """Title -> runs of the walking quadrupeds that were run at several scales."""
     return {
-        TASKS[task] + ", unscaled" * is_unscaled(scale): runs
+        f"{titled(task, runs)}{', unscaled' * is_unscaled(scale)}": runs
         for task in WALKING
         for scale, runs in by_scale(loaded, task).items()
         if len(by_scale(loaded, task)) > 1

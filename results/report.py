@@ -45,17 +45,18 @@ DETAILS = """# Every run of the study
 
 Written by `python results/report.py`; [Results](../README.md) says what these tables mean. A folder has the arguments,
 rows and evaluation of one run: `<scale>/<task>/<method>/seed<k>`. Figures after ± are standard deviations over seeds
-(ddof 1). [grid.py](../grid.py) has the scales. Of each, the first table is of the training; iterations are those to
-50% and 90% of what PIDM random of that scale and PyTorch's weights ends at. The second is of the mean action at its
-end: without exploration noise, 64 episodes a seed, return, length [s], share of falls, errors of the velocity [m/s], of
-the yaw rate [rad/s] and of the foot [m]. The third is of its gait, by [tools/gait.py](../../docs/play.md): falls as a
-share of the episodes, the rest from flat ground.
+(ddof 1). [grid.py](../grid.py) has the scales. Each has up to three tables. The first is of the training; iterations
+are those to 50% and 90% of the final performance of that scale's PIDM random with PyTorch's weights. The second is of
+the mean action at its end: without exploration noise, 64 episodes a seed, return, length [s], share of falls, errors of
+the velocity [m/s], of the yaw rate [rad/s] and of the foot [m]. The third is of its gait, by
+[tools/gait.py](../../docs/play.md): falls as a share of the episodes, the rest from flat ground.
 """
 CONTROLS_HEAD = """## Controls
 
-Comparisons beyond the paper, on the seeds named, which both methods have; the second one sets the 50% and 90%.
-`orthogonal` names initial weights, others are PyTorch's; small steps are at most 0.003, not 0.01. `*`: one ran on a
-CPU, the other on a GPU. Early updates are of the first 100 iterations. [Curves](controls.png) of 256 environments.
+Comparisons beyond the paper, on the seeds named, which both methods have; 50% and 90% are of the second one's final
+performance. `orthogonal`: initial weights; all others have PyTorch's. Small steps are at most 0.003, not 0.01. `*`: one
+ran on a CPU, the other on a GPU. Early updates are of the first 100 iterations. [Curves](controls.png) of 256
+environments.
 """
 MARKED = re.compile(r"(<!-- results/report\.py writes ?([\w -]*?) ?from here -->\n).*?(<!-- to here -->)", re.S)
 
@@ -147,7 +148,7 @@ def draw_all(loaded):
     study = pick(loaded)
     drawn = {
         "curves": lambda path: drawing.draw_curves(
-            {drawing.title(task, runs): runs for task, runs in study.items()}, path
+            {drawing.titled(task, runs): runs for task, runs in study.items()}, path
         ),
         "curves_batch": lambda path: drawing.draw_curves(drawing.curves_by_scale(loaded), path),
         "controls": lambda path: drawing.draw_controls(pick(loaded, CONTROLS), path),
@@ -166,15 +167,19 @@ def draw_all(loaded):
 def compare(folder):
     """Draw the runs of a task, <folder>/<method>/seed<k>, and print what they reach. UserError if none is complete."""
     runs = tables.load_task(folder.resolve(), evaluated=False)
+    for other in sorted({path.parent.parent for path in folder.glob("*/seed*/args.json")}):
+        if other.name not in METHODS:
+            tables.left_out(other, f"methods are {', '.join(METHODS)}")
     if not runs:
         raise records.UserError(f"{folder} has no complete runs <method>/seed<k>; methods are {', '.join(METHODS)}")
     task = folder.resolve().name
     print("\n".join(tables.progress_table({task: runs})))
     if "pidm_random" in runs:
-        rows = [{"against PIDM random": METHODS[m].title} | tables.compared(task, runs, m) for m in runs]
-        print("\n".join(["", *tables.markdown(tables.without_empty(rows))]))
+        others = [method for method in runs if method != "pidm_random"]
+        rows = [{"against PIDM random": METHODS[m].title} | tables.compared(task, runs, m) for m in others]
+        print("\n".join(["", *tables.markdown(tables.without_empty(rows) if rows else [])]))
     path = folder / "curves.png"
-    drawing.draw_curves({drawing.title(task, runs): runs}, path, tuple(METHODS))
+    drawing.draw_curves({drawing.titled(task, runs): runs}, path, tuple(METHODS))
     print(f"wrote {path}")
 
 
@@ -187,9 +192,8 @@ def beside(folder):
         args = json.loads((folder / "args.json").read_text())
         task, config = args["task"], task_of(args["config"])
         rows = records.read_rows(folder / "metrics.csv")
-        name = next(name for name in tables.INDICATORS if name in rows[0])
-        points = [(row["iteration"], row[name]) for row in rows]
-    except (OSError, ValueError, KeyError, IndexError, TypeError, StopIteration) as error:
+        iterations = [row["iteration"] for row in rows]
+    except (OSError, ValueError, KeyError, IndexError, TypeError) as error:
         raise records.UserError(f"{folder} is not a run of ppo_finetune.py: {error}") from None
     known = [study[task] for study in load_study().values() if task in study]
     if not known:
@@ -202,10 +206,9 @@ def beside(folder):
     runs = max(known, key=likeness)
     if not likeness(runs)[0]:
         print(f"the recorded runs of {task} had other numbers in its config")
-    path = folder / "beside_recorded.png"
-    drawing.draw_curves(
-        {drawing.title(task, runs): runs}, path, tuple(METHODS), ("this run", *zip(*points, strict=True))
-    )
+    name = next(iter(runs.values()))[0]["settings"]["indicator"]
+    path, this = folder / "beside_recorded.png", ("this run", iterations, [row[name] for row in rows])
+    drawing.draw_curves({drawing.titled(task, runs): runs}, path, tuple(METHODS), this)
     print(f"wrote {path}")
 
 

@@ -150,7 +150,8 @@ def main(args):
         return show_status(runs)
     missing = [cell for cells in runs.values() for cell in cells if not cell.done()]
     if not missing:
-        print("all of these runs are recorded under results/study; to repeat one, first move its folder away")
+        words = "all of these runs are recorded under results/study; to repeat one, first move its folder away"
+        print(words, file=sys.stderr)  # what --list prints is run
     for path in dict.fromkeys(filter(None, (cell.lacks() for cell in missing))):
         print(f"left out: runs from {path}, which is missing; results/pidm.py makes it", file=sys.stderr)
     start = time.perf_counter()

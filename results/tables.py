@@ -86,17 +86,18 @@ def load_run(folder, evaluated=True):
         rows = records.read_rows(folder / "metrics.csv")
         columns = {name: np.array([row[name] for row in rows]) for name in rows[0]}
         complete = bool(columns["env_steps"][-1] >= float(record["total_steps"]))
+        indicator = next(name for name in INDICATORS if name in columns)
         keys = ("num_envs", "num_steps", "total_steps", "lr", "num_epochs", "mirror_coef")
         success = {name: one["episode_success"] for name, one in result.items() if name.startswith("level ")}
         run = {
             "columns": columns,
             "iteration": columns["iteration"],
-            "indicator": columns[next(name for name in INDICATORS if name in columns)],
+            "indicator": columns[indicator],
             "errors": dict(result.get("task", {})),
             "gait": result.get("gait", {}),
             "success": list(success.values()),
             "settings": {key: record[key] for key in keys}
-            | {"config": task_of(record["config"]), "levels": list(success)},
+            | {"config": task_of(record["config"]), "levels": list(success), "indicator": indicator},
             "seed": record["seed"],
             "earlier": is_earlier(*folder.parts[-4:-2]),
             "versions": record["versions"],
@@ -265,7 +266,7 @@ def controls(loaded):
         studies = [study[task] for study in loaded.values() if task in study]
         for runs, (method, against) in itertools.product(studies, PAIRS):
             if arms := measures.same_seeds(runs, method, against):
-                devices = {run.get("versions", {}).get("device") for arm in arms.values() for run in arm}
+                devices = {on_cpu(run) for arm in arms.values() for run in arm}
                 row = {"task": drawing.title(task, runs), "batch": drawing.batch(runs) + " *" * (len(devices) > 1)}
                 row |= {"method": METHODS[method].title, "against": METHODS[against].title}
                 row["seeds"] = ", ".join(str(run["seed"]) for run in arms[method])
@@ -273,6 +274,11 @@ def controls(loaded):
                 row["better at the end, of seeds"] = wins(arms, method, "final", against)
                 rows.append(row | {"early updates of the backbone [%]": early_updates(arms, method, against)})
     return markdown(rows)
+
+
+def on_cpu(run):
+    """True if a run was made on a CPU, which older records call cpu:0."""
+    return run.get("versions", {}).get("device", "cpu").startswith("cpu")
 
 
 def compared(task, runs, method, against="pidm_random"):
@@ -302,8 +308,9 @@ def gait_table(study):
                 row = {"task": drawing.title(task, runs), "method": METHODS[method].title, "seeds": str(len(mine))}
                 for name, title in GAIT.items():
                     episodes = name.replace("falls", "episodes")
-                    each = [gait[name] / (gait[episodes] if episodes != name else 1) for gait in mine]
-                    row[title] = f"{np.mean(each):.3g}"
+                    known = [gait for gait in mine if gait[name] is not None]
+                    each = [gait[name] / (gait[episodes] if episodes != name else 1) for gait in known]
+                    row[title] = f"{np.mean(each):.3g}" if each else ""
                 rows.append(row)
     return markdown(rows)
 
@@ -362,7 +369,7 @@ def progress_table(study):
             row = {"task": drawing.title(task, runs), "method": METHODS[method].title}
             row["seeds"] = ", ".join(str(run["seed"]) for run in mine)
             row["final"] = spread(each["final"])
-            row["of it in the last third [%]"] = f"{100 * np.mean([measures.late_gain(run) for run in mine]):.0f}"
+            row["gained in the last third [%]"] = f"{100 * np.mean([measures.late_gain(run) for run in mine]):.0f}"
             row["mean of the training"] = spread(each["area"])
             highest = [run["columns"]["progress"] for run in mine if "progress_reached" in run["columns"]]
             row["solved at the end"] = spread([one[-1] for one in highest]) if highest else ""

@@ -660,8 +660,8 @@ def test_a_weight_without_its_term_is_named(jitted):
             jax.eval_shape(lambda key: env.step(env.reset(key), jnp.zeros(12)), jax.random.key(0))
 
 
-def test_a_task_of_one_s_own(monkeypatch, tmp_path):
-    """Found by name, and trained from scratch without a word of it elsewhere."""
+def test_a_task_of_one_s_own(monkeypatch):
+    """Found by name without a word of it elsewhere."""
     family, config = envs.TASKS["go1_loco"]
     monkeypatch.setitem(envs.OWN, "go1_mine", (family, envs.replace_checked(config, {"yaw_rate": 0.5})))
     assert envs.make("go1_mine", "c").config.yaw_rate == 0.5 and envs.family("go1_mine") is family

@@ -313,7 +313,7 @@ def test_bad_arguments_are_refused(changes, words, tmp_path, refused):
 
 @pytest.fixture
 def no_state(monkeypatch):
-    """For what is refused after the first state was made, whatever it is."""
+    """Makes the first state cheap, for runs that are refused after it."""
     monkeypatch.setattr(script, "init_state", lambda args, **_: jnp.zeros(1))
 
 

@@ -81,6 +81,8 @@ def test_metadata_of_the_file(exported):
     facts = play_onnx.Player(exported).facts
     assert facts["task"] == "go1_loco" and len(facts["joints"]) == len(facts["default_pose"]) == 12
     assert facts["action_scale"] == [0.25] * 12 and "gait_hz" not in facts, "no clock, no input of one"
+    assert facts["command_ranges"]["forward [m/s]"] == [-1.0, 1.0] and not facts["robust"]
+    assert np.shape(facts["joint_range"]) == (12, 2) and np.less(*np.transpose(facts["joint_range"])).all()
     assert facts["prop"] == list(PROP) and facts["dt"] == 0.02 and "commit" in facts["versions"]
 
 

@@ -229,10 +229,22 @@ def test_a_recorded_policy_from_end_to_end(tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    "left", ["left_foot", "leg_front_left_foot", "LF_foot", "RL_calf_foot", "BL_foot", "LM_foot", "leg_l_foot"]
+    "left",
+    [
+        "left_foot",
+        "leg_front_left_foot",
+        "LF_foot",
+        "RL_calf_foot",
+        "BL_foot",
+        "LM_foot",
+        "leg_l_foot",
+        "LeftFoot",
+        "lleg_link",
+    ],
 )
 def test_left_feet_are_known_by_their_names(left):
-    right = left.replace("left", "right").replace("_l_", "_r_").replace("L", "R")
+    right = left.replace("Left", "Right").replace("left", "right").replace("_l_", "_r_").replace("lleg", "rleg")
+    right = right.replace("L", "R")
     assert gait.is_left(left) and not gait.is_left(right)
 
 
@@ -279,6 +291,23 @@ def test_changes_reach_the_robot(jitted):
     force = {name: r.foot_force[60:100, 0, :, 2].sum(-1).mean() for name, r in seen.items()}
     assert force["load"] - force["plain"] == pytest.approx(3 * gait.GRAVITY, rel=0.15)
     assert all(r.alive.all() for r in seen.values())
+
+
+def test_a_delay_that_an_environment_cannot_keep_is_not_measured(monkeypatch):
+    """60 ms of the training and 40 ms of the test are five steps; four are kept."""
+    asked = []
+
+    def run(env, net, params, commands, changes):
+        asked.append([*changes])
+        return {name: walk() for name in commands}
+
+    monkeypatch.setattr(tool, "run", run)
+    args = tool.Args(str(TASKS / "go1_loco/policy.msgpack"), starts=1, set=("action_delay=0.06,0.06",))
+    monkeypatch.setattr(gait, "measure", lambda *_: dict.fromkeys(("falls", "episodes", "turning"), 1.0))
+    monkeypatch.setattr(gait, "summary", lambda by_command, robustness: robustness)
+    _, found = tool.evaluate(args)
+    late, *others = found
+    assert late == "delay of 40 ms" and found[late] is None and late not in asked[0] and {*others} == {*asked[0]}
 
 
 def test_the_task_is_nominal():

@@ -69,7 +69,7 @@ def test_same_seed_same_weights(trained, tmp_path):
 
 @pytest.fixture
 def no_state(monkeypatch):
-    """For what is refused after the first state was made, whatever it is."""
+    """Makes the first state cheap, for runs that are refused after it."""
     monkeypatch.setattr(script, "init_state", lambda args, **_: jnp.zeros(1))
 
 

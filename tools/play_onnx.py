@@ -66,7 +66,8 @@ class Player:
         self.facts = {name: json.loads(value) for name, value in facts.items()}
         self.pose = np.array(self.facts["default_pose"])
         trained = self.facts.get("command_ranges", dict.fromkeys("xyz", (-1.0, 1.0)))  # older files do not say
-        self.low, self.high = np.array([*trained.values()]).T  # of the command: m/s, m/s, rad/s
+        ranges = np.array([*trained.values()]).reshape(-1, 2)  # none for a task without commands
+        self.low, self.high = ranges.T  # of the command: m/s, m/s, rad/s
         self.shapes = {given.name: given.shape for given in self.session.get_inputs()}
         spec = self.spec()
         plane = mujoco.mjtGeom.mjGEOM_PLANE

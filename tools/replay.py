@@ -4,10 +4,10 @@
     python tools/replay.py runs/go1_loco/mlp/seed0/nan.npz
 
 The first command repeats the training, bit for bit on engine c, up to the first rollout with a number that is not
-finite or a simulation that diverged. nan.npz holds these environments up to that step: qpos, qvel (steps, environments,
-...) before each control step, the joint targets `ctrl`, and the environments' numbers. If no robot failed, it was the
-update of the weights. The second command steps the dumped robots in plain MuJoCo, with the masses and the friction of
-their file and joints that do not rub: those of the episodes are not in the dump.
+finite or a simulation that diverged. nan.npz holds these environments up to that step: qpos, qvel, obstacles and forces
+on bodies (steps, environments, ...) before each control step, the joint targets `ctrl`, and the environments' numbers.
+If no robot failed, it was the update of the weights. The second command steps the dumped robots in plain MuJoCo, with
+the masses and friction of their file and without joint friction: those of the episodes are not in the dump.
 """
 
 import io
@@ -95,7 +95,7 @@ def repeat(path):
     try:
         with np.load(path, allow_pickle=False) as file:
             names = (*DUMPED, "environment", "task", "robot", "robust", "set")
-            dump = {name: file[name] for name in names}
+            dump = {name: file[name] for name in names if name in file or name != "xfrc_applied"}  # older ones lack it
         args = ppo_finetune.Args(task=str(dump["task"]), engine="c", set=tuple(dump["set"].tolist()))
         make = partial(envs.make, robust=bool(dump["robust"]), robot=str(dump["robot"]) or None)
         env = make_env(make, args.task, args)
@@ -106,7 +106,7 @@ def repeat(path):
     env.model.dof_frictionloss[:] = 0.0
     for i, number in enumerate(dump["environment"]):
         data = mujoco.MjData(env.model)
-        for name in DUMPED:
+        for name in [name for name in DUMPED if name in dump]:
             getattr(data, name)[:] = dump[name][-1, i]
         print(
             f"environment {number}: base at {np.round(data.qpos[:3], 2)} m, joint targets {np.round(data.ctrl, 2)} rad"
