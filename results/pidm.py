@@ -309,10 +309,10 @@ outputs of the actor's backbone in the first rollout of a task. Their effective 
 number of directions, of 64, that they fill. The study's pretrained arm is "loaded, the rest as PyTorch's".
 
 """
-AGAIN = ("anymal_d", "go1")  # robots whose weights are older than the data they were measured on, until made anew
-FIRST = """Of {robots}: errors were measured (`--stages collect validate`) on a collection that these commands made on
-another machine. It differs in its bits, so the weights have seen nothing of it. The last row of metrics.csv is on the
-collection of the training.
+AGAIN = ("anymal_d", "g1", "go1")  # robots whose weights are older than the data they were measured on, until made anew
+FIRST = """Of {robots}: errors were measured (`--stages collect validate`) on a collection that these commands made
+later, on another machine or with other random numbers. So the weights have seen nothing of it. The last row of
+metrics.csv is on the collection of the training.
 
 """
 
