@@ -49,7 +49,7 @@ class Args:
     num_envs: int | None = None  # N environments at once
     num_steps: int | None = None  # T steps of each in an iteration
     total_steps: int | None = None  # transitions to collect
-    validation: float = 0.08  # share of environments held out (paper: 600 k of 7.6 M samples)
+    validation: float = 0.08  # share of environments held out (paper: 7 M to train, 600 k to validate)
     # --- Exploration ---
     policy: Literal["explore", "random"] = "explore"  # random: the initial policy throughout, for comparison
     disagreement_coef: float = 2.0  # reward per second at the mean disagreement; must exceed the regularisers' cost

@@ -224,7 +224,7 @@ BLIND_QUADRUPED = {
     "gpu": {"total_steps": 29_500_000},
 }
 
-# --robust: what a robot meets and a simulation lacks, and commands as a person gives them. Ours; not in the paper.
+# --robust: what a robot meets and a simulation lacks, and commands as a person gives them. Ours.
 ROBUST = {
     "spawn_joints": (0.8, 1.2),
     "spawn_velocity": 0.5,

@@ -5,8 +5,8 @@
     python results/pidm.py --robots anymal_d --stages sizes
     python results/pidm.py --stages collect validate
 
-It makes them at the paper's size: 7.6 M transitions of a robot, of which 0.6 M are for validation, and at most 100
-epochs. Files take 1.4 GB (G1 2.9).
+It makes them from as many transitions as the paper, 7.6 M of which 0.6 M validate, in at most 100 epochs. Files take
+1.4 GB (G1 2.9).
 Weights go to assets/pidm/<robot>.msgpack, everything else to results/pidm/<robot>. Stage `sizes` also pretrains on
 small random parts of the data of stage `collect` (paper Sec. V-D), into results/pidm/<robot>/sizes. Stage `validate`
 measures the shipped weights again, on the data of stage `collect`.
@@ -298,8 +298,8 @@ The commands that stand below for each robot made them. Now `python results/pidm
 trains until the error is flat, 100 epochs at most.
 
 Errors are on held-out environments, with the tasks' sensor noise. error_over_change is error_rad over the mean action
-magnitude |a_t - q_t|, joint target minus joint angle: the paper's normalised error, 0.4 to 0.5 there. normalized_error
-is over the mean action.
+magnitude |a_t - q_t|, joint target minus joint angle. The paper's, of the joint angle one step later, is 0.4 to 0.5.
+normalized_error is over the mean action.
 
 Joint space is the share of a 20 x 20 grid over each pair of neighbouring joints of a limb that 20,000 samples visit.
 Maps have a panel for each set of states, 4,000 of each. Grey cells are those that exploration visits. Disagreement is
