@@ -1,5 +1,5 @@
 # make demo   train a walking Go1 on this CPU from the shipped PIDM, evaluate it, write pictures
-# make test   everything CI runs but the smoke runs of the scripts
+# make test   everything CI runs but the smoke runs and the tests of optional packages
 PYTHON ?= python3
 BIN = .venv/bin
 

@@ -335,7 +335,6 @@ def rollout(args, env, net, params, env_state, key):
     """Act for T steps in N environments. Returns the last state, Rollout, Transitions, data to store and metrics."""
 
     def step(before, key):
-        # sample an action
         inputs = net.inputs(before.obs, before.history)
         mean, log_std, value = net.apply(params, inputs)
         action = mean + jnp.exp(log_std) * jax.random.normal(key, mean.shape)

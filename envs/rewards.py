@@ -52,7 +52,7 @@ def power(torque, joint_vel, weight):
 
 
 def moving(command):
-    """1 if the command asks for more than 0.1 m/s or 0.1 rad/s, else 0, so that standing still needs no steps."""
+    """True () if the command (3,) asks for more than 0.1 m/s or 0.1 rad/s: standing still needs no steps."""
     return (jnp.linalg.norm(command[:2]) > 0.1) | (jnp.abs(command[2]) > 0.1)
 
 
@@ -67,5 +67,5 @@ def touching(force):
 
 
 def beyond(joint_pos, low, high):
-    """Sum of joint angles beyond their limits [rad]."""
+    """Sum of joint angles beyond their limits [rad]; (A,) each."""
     return jnp.sum(jnp.maximum(low - joint_pos, 0) + jnp.maximum(joint_pos - high, 0))

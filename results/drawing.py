@@ -22,7 +22,6 @@ COLOURS = {  # of a method; dashed if only its initial weights or largest step s
     "pidm_7k": "#BBBBBB",
     "pidm_70k": "#888888",
     "pidm_700k": "#444444",
-    "pidm_history": "#8C6D00",
 }
 
 

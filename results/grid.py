@@ -68,11 +68,6 @@ METHODS = {
     "mlp_orthogonal": Method("MLP, orthogonal", "beyond the paper", "--network mlp"),
     "pidm_random_orthogonal": Method("PIDM random, orthogonal", "beyond the paper", "--network pidm"),
     "pidm_pretrained_orthogonal": Method("PIDM pretrained, orthogonal", "beyond the paper", SHIPPED),
-    "pidm_history_orthogonal": Method(
-        "PIDM pretrained, history encoder only, orthogonal",
-        "beyond the paper",
-        f"{SHIPPED} --load-into history_encoder",
-    ),
     "pidm_random_unscaled": Method("PIDM random, unscaled", "beyond the paper", f"--network pidm {UNSCALED}"),
     "pidm_random_slow": Method("PIDM random, small steps", "beyond the paper", f"--network pidm {PAPER} {SLOW}"),
     "pidm_pretrained_slow": Method("PIDM pretrained, small steps", "beyond the paper", f"{SHIPPED} {PAPER} {SLOW}"),

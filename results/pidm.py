@@ -294,8 +294,8 @@ def draw_coverage(points, title, path, gridsize=30):
 
 HEAD = """# Shipped PIDM checkpoints
 
-The commands that stand below for each robot made them. Now `python results/pidm.py` collects 7.6 M transitions and
-trains until the error is flat, 100 epochs at most.
+The commands that stand below for each robot made them (anymal_d's with uncommitted changes). Now `python
+results/pidm.py` collects 7.6 M transitions and trains until the error is flat, 100 epochs at most.
 
 Errors are on held-out environments, with the tasks' sensor noise. error_over_change is error_rad over the mean action
 magnitude |a_t - q_t|, joint target minus joint angle. The paper's, of the joint angle one step later, is 0.4 to 0.5.

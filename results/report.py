@@ -29,6 +29,7 @@ from results import drawing, tables
 from results.grid import CONTROLS, METHODS, SCALES, TABLE_1, TASKS, task_of, titles
 
 STUDY = ROOT / "results/study"
+PARTS = ROOT / "results/pidm_large"  # PIDMs of the whole collection and of parts of it
 
 
 @dataclass(frozen=True)
@@ -91,7 +92,7 @@ def readme_table(study):
 
 def sizes(study, methods, tasks):
     """`ablation` of the sizes of the pretraining set, and below it the errors and the figure once there are two."""
-    lines, errors = tables.ablation(study, methods, tasks), tables.sizes_of("anymal_d")
+    lines, errors = tables.ablation(study, methods, tasks), tables.sizes_of(PARTS)
     if len(errors) < 2:
         return lines
     table = [*lines, ""] if lines else []
@@ -155,7 +156,7 @@ def draw_all(loaded):
         "critics": lambda path: drawing.draw_critics(loaded.get("batch", {}), path),
         "updates": lambda path: drawing.draw_updates(study, path),
         "success": lambda path: drawing.draw_success(study, path),
-        "sizes": lambda path: drawing.draw_sizes(pick(loaded, titles("sizes")), path, tables.sizes_of("anymal_d")),
+        "sizes": lambda path: drawing.draw_sizes(pick(loaded, titles("sizes")), path, tables.sizes_of(PARTS)),
         "batch": lambda path: drawing.draw_batch(loaded, path),
     }
     for name, draw in drawn.items():

@@ -41,7 +41,6 @@ PAIRS = (  # of methods of which one or both are beyond the paper: the second is
     ("pidm_pretrained", "pidm_shuffled"),
     ("pidm_random_orthogonal", "pidm_random"),
     ("pidm_pretrained_orthogonal", "pidm_random_orthogonal"),
-    ("pidm_history_orthogonal", "pidm_random_orthogonal"),
     ("pidm_pretrained", "pidm_random_orthogonal"),
     ("mlp_orthogonal", "mlp"),
     ("pidm_pretrained_unscaled", "pidm_random_unscaled"),
@@ -436,9 +435,9 @@ def pidm_table():
     return markdown(rows)
 
 
-def sizes_of(robot):
-    """Mean absolute error [rad] on held-out transitions, by number of those trained on by results/pidm.py."""
-    folder, found = ROOT / f"results/pidm/{robot}", {}
+def sizes_of(folder):
+    """Mean absolute error [rad] on held-out transitions, by number of those that the PIDMs of a folder had."""
+    found = {}
     for path in [*folder.glob("sizes/*_validation.json"), folder / "validation.json"]:
         stem = path.stem.removesuffix("validation")
         count = int(records.read_rows(path.with_name(f"{stem}metrics.csv"))[0]["samples"])  # of the first epoch

@@ -696,7 +696,7 @@ def test_report_writes_the_same_bytes_twice(tmp_path, monkeypatch):
         report.draw_all({"cpu": study})
         images.append({path.name: path.read_bytes() for path in tmp_path.iterdir()})
     assert images[0] == images[1]
-    assert {*images[0]} == {f"{name}.{kind}" for name in ("curves", "controls") for kind in ("png", "svg")}
+    assert {*images[0]} == {f"{name}.{kind}" for name in ("curves", "controls", "sizes") for kind in ("png", "svg")}
 
 
 def test_figures_of_parkour_and_updates_are_drawn(tmp_path, monkeypatch):
@@ -709,8 +709,11 @@ def test_figures_of_parkour_and_updates_are_drawn(tmp_path, monkeypatch):
         report.draw_all({"cpu": study})
         return sorted(path.name for path in tmp_path.iterdir())
 
-    assert drawn(study) == [f"{name}.{kind}" for name in ("curves", "success", "updates") for kind in ("png", "svg")]
-    assert drawn({"anymal_jump": study["anymal_jump"]}) == ["curves.png", "curves.svg", "success.png", "success.svg"]
+    names = ("curves", "success", "sizes", "updates")
+    assert drawn(study) == sorted(f"{name}.{kind}" for name in names for kind in ("png", "svg"))
+    assert drawn({"anymal_jump": study["anymal_jump"]}) == sorted(
+        f"{name}.{kind}" for name in names[:3] for kind in ("png", "svg")
+    )
 
 
 def test_each_table_takes_the_scale_that_has_most_of_its_methods():
@@ -833,17 +836,17 @@ def test_indicator_of_parkour_is_the_level_reached(study, capsys):
 
 
 def test_sizes_are_those_that_were_pretrained_on(tmp_path, monkeypatch):
-    monkeypatch.setattr(tables, "ROOT", tmp_path)
-    folder = tmp_path / "results/pidm/anymal_d"
+    folder = tmp_path / "pidm"
+    monkeypatch.setattr(report, "PARTS", folder)
     (folder / "sizes").mkdir(parents=True)
     for stem, samples, error in (("sizes/7000_", 7000, 0.9), ("sizes/70000_", 70000, 0.6), ("", 920000, 0.3)):
         (folder / f"{stem}validation.json").write_text(json.dumps({"error_rad": error, "normalized_error": 2 * error}))
         (folder / f"{stem}metrics.csv").write_text(f"iteration,samples\n1.0,{samples}.0\n2.0,{2 * samples}.0\n")
-    assert tables.sizes_of("anymal_d") == {7000: 0.9, 70000: 0.6, 920000: 0.3}
+    assert tables.sizes_of(folder) == {7000: 0.9, 70000: 0.6, 920000: 0.3}
     run = {"pidm_random": flat(10.0, 11.0), "pidm_7k": flat(9.0, 9.5), "pidm_pretrained": flat(12.0, 13.0)}
     study = {"anymal_climb_up": run, "anymal_climb_down": run}
-    assert drawing.draw_sizes(study, tmp_path / "sizes.png", tables.sizes_of("anymal_d"))
-    assert drawing.draw_sizes({}, tmp_path / "errors.png", tables.sizes_of("anymal_d"))
+    assert drawing.draw_sizes(study, tmp_path / "sizes.png", tables.sizes_of(folder))
+    assert drawing.draw_sizes({}, tmp_path / "errors.png", tables.sizes_of(folder))
     both, errors = (matplotlib.image.imread(tmp_path / f"{name}.png").shape[1] for name in ("sizes", "errors"))
     assert both == 2 * errors  # no empty panel where no task was run with them
     lines = report.sizes(study, report.titles("sizes"), tuple(study))
@@ -856,11 +859,11 @@ def test_what_has_not_run_is_named():
     """Below Table II the sizes; a table where one of its methods has run, else which have not."""
     runs = {"pidm_random": flat(10.0), "pidm_actor": flat(12.0)}
     loaded = {"batch": {"anymal_climb_up": runs, "anymal_climb_down": runs}}
-    names = ("actor only; PIDM pretrained, critic only", "70 k; PIDM pretrained on 700 k")
-    (line,) = report.table_2({})
-    assert names[0] in line and names[1] in line
-    *table, blank, last = report.table_2(loaded)
-    assert "+20.0" in "".join(table) and not blank and names[0] not in last and names[1] in last
+    names = "actor only; PIDM pretrained, critic only"
+    error, _, figure, _, line = report.table_2({})
+    assert names in line and error.endswith("No task was run with the smaller sets yet.") and "sizes.png" in figure
+    *table, error, _, _ = report.table_2(loaded)
+    assert "+20.0" in "".join(table) and error.startswith("Error by number of transitions") and names not in str(table)
 
 
 def test_comparisons_across_machines_have_a_star():

@@ -150,7 +150,7 @@ def advice(body, stood, mirrors):
     rules = {
         f"damping ratios below 0.25 let joints swing: raise kd of {of(loose)}": loose.any(),
         f"an action moves {of(stiff)} by less than 0.06 rad: lower kp, or raise action_scale": stiff.any(),
-        "standing takes over 70 % of a torque limit: straighten [pose]": stood["torque [share of limit]"] > 0.7,
+        "standing takes over 70% of a torque limit: straighten [pose]": stood["torque [share of limit]"] > 0.7,
         "a joint sags by more than 0.2 rad: raise kp, or straighten [pose]": stood["joint error [rad]"] > 0.2,
         "its mass is not above its feet: change ankles or hips in [pose]": ahead > 0.03,
         "a foot hangs in the air: change [pose], or name the feet": feet < len(body["feet"])
