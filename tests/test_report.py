@@ -589,17 +589,22 @@ def test_words_on_feet_and_first_actions_are_what_was_recorded():
     )
     assert "{:.2f} against {:.2f} m; its falls, ".format(*feet) in text
     assert "its falls, {:.0f}% and not {:.0f}%,".format(*(100 * share for share in falls)) in text
-    gains, later = [], []
+    gains, later, counts = [], [], []
     for task in ("go1_loco", "anymal_loco"):
         arms = [recorded(task, f"pidm_{m}", "256") for m in ("pretrained", "random")]
+        counts.append(len(arms[0]))
         final = [arm[:, -4:].mean() for arm in arms]
         there = [np.mean([1 + np.argmax(run >= 0.9 * final[1]) for run in arm]) for arm in arms]
         gains.append(100 * (final[0] / final[1] - 1))
         later.append(100 * (there[0] / there[1] - 1))
-    said = f"Go1 gains {gains[0]:.1f}% after {later[0]:.0f}% more iterations, "
-    assert said + f"ANYmal D {gains[1]:.1f}% after {-later[1]:.0f}% fewer." in text
-    said = f"{gains[1]:.0f}% higher, in {-later[1]:.0f}% fewer (n = 1). Go1 ends alike; with small ones it needs "
-    assert said + f"{later[0]:.0f}% more." in " ".join((report.ROOT / "README.md").read_text().split())
+    said = f"Go1 gains {gains[0]:.1f}% after {later[0]:.0f}% more iterations (n = {counts[0]}), "
+    assert said + f"ANYmal D {gains[1]:.1f}% after {-later[1]:.0f}% fewer (n = {counts[1]})." in text
+    assert f"and {gains[1]:.1f}% with small first actions (n = {counts[1]})" in text
+    said = f"{gains[1]:.0f}% higher, in {-later[1]:.0f}% fewer (n = {counts[1]}). Go1 ends alike; with small ones it "
+    assert said + f"needs {later[0]:.0f}% more." in " ".join((report.ROOT / "README.md").read_text().split())
+    small, large = (recorded("anymal_loco", "pidm_random", scale)[:2, -4:].mean(1) for scale in ("256", "cpu"))
+    changes = 100 * (small / large - 1)
+    assert "by {:+.0f}% and {:+.0f}% on ANYmal D (seeds 0 and 1)".format(*changes) in text
 
 
 def rows_of(scale):
