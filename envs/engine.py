@@ -360,6 +360,7 @@ ENGINES = {"c": CEngine, "mjx": MjxEngine, "warp": WarpEngine}
 
 @functools.cache
 def say_once(text):
+    """Print a line, once a process."""
     print(text)
 
 

@@ -369,6 +369,7 @@ def make(robot, stages):
 
 
 def main(args):
+    """Run the stages for each robot, and write results/pidm/README.md. UserError for an unknown robot."""
     devices.find()
     if unknown := {*args.robots} - envs.EXPLORE.keys():
         raise records.UserError(f"unknown robot {unknown.pop()!r}; choose of {', '.join(envs.EXPLORE)}")

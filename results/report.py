@@ -254,6 +254,7 @@ def write_all(check):
 
 
 def main(args):
+    """Write the report, or compare, draw or follow runs. UserError for the folder of several seeds."""
     if args.compare:
         return compare(Path(args.compare))
     for folder, act in ((args.beside, beside), (args.live, live)):

@@ -145,6 +145,7 @@ def run(cell, seconds):
 
 
 def main(args):
+    """Train what is missing, or list it."""
     runs = planned(args)
     if args.status:
         return show_status(runs)

@@ -52,6 +52,7 @@ def draw_levels(folder):
 
 
 def main(args):
+    """Train, evaluate and keep a run of each task. UserError for an unknown one."""
     for name in {*args.tasks} - envs.TASKS.keys():
         raise records.UserError(f"unknown task {name!r}; known: {', '.join(envs.TASKS)}")
     for task in args.tasks:

@@ -263,6 +263,7 @@ def with_ratios(rows):
 
 
 def main(args):
+    """Measure the parts and write the page. UserError for an unknown task, or peers without --peers."""
     devices.find()
     if args.cell:
         name, *inputs = json.loads(args.cell)

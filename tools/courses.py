@@ -47,6 +47,7 @@ def picture(env, level, key):
 
 
 def main():
+    """Draw every skill at the levels, into results/courses.png."""
     devices.find()
     tasks = [task for task, (family, _) in envs.TASKS.items() if family is parkour.Parkour]
     images = []

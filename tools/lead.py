@@ -100,6 +100,7 @@ def row(task, name, start, count, gap, tall):
 
 
 def main():
+    """Draw the README's picture of three walking robots."""
     images = [row(task, *about) for task, about in ROWS.items()]
     sheet = Image.new("RGB", (WIDTH, sum(image.height + BETWEEN for image in images) - BETWEEN), "white")
     top = 0

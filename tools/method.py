@@ -167,6 +167,7 @@ def legend(ax):
 
 
 def main():
+    """Draw docs/method.png."""
     devices.find()
     fig = Figure((WIDTH / 72, HEIGHT / 72), dpi=72)  # so that a point is a pixel
     ax = fig.add_axes((0, 0, 1, 1))

@@ -190,6 +190,7 @@ def fail(text):
 
 
 def main(args):
+    """Drive the robot, in a window or for some seconds. Bad input gets one line and exit code 2."""
     if not 0.1 <= args.seconds <= 3600:
         fail(f"--seconds must be from 0.1 to 3600, not {args.seconds}")
     try:

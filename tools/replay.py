@@ -120,6 +120,7 @@ def repeat(path):
 
 
 def main(args):
+    """Find the robots that failed in a run, or repeat those of a dump."""
     if Path(args.path).suffix == ".npz":
         return repeat(Path(args.path))
     return find(Path(args.path), args.iterations, args.robots)
