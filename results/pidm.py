@@ -37,8 +37,8 @@ import pretrain_pidm
 from experiment import devices, figures, records
 from results import recording
 
-SIZES = (7_000, 70_000, 700_000)  # transitions; the fourth of the paper's sizes, 7 M, is the whole collection
-EXPLORE = ("--total-steps", "7600000")
+PART_SIZES = (7_000, 70_000, 700_000)  # transitions; the fourth of the paper's sizes, 7 M, is the whole collection
+EXPLORE_FLAGS = ("--total-steps", "7600000")
 PRETRAIN = ("--epochs", "100", "--patience", "10")
 BLIND = tuple(name for name, (family, _) in envs.TASKS.items() if not family.LEVELS)  # tasks on flat ground
 EARLY = 100  # iterations of a task's training whose states the coverage figure shows (paper Fig. 4a)
@@ -83,8 +83,8 @@ def validate(robot):
 
 
 def pretrain_on_parts(robot):
-    """Pretrain on each of SIZES. Weights and validation error go to files of that name."""
-    for size in SIZES:
+    """Pretrain on each of PART_SIZES. Weights and validation error go to files of that name."""
+    for size in PART_SIZES:
         folder = f"runs/pidm/{robot}/{size}"
         words = ("--data", f"runs/explore/{robot}/seed0", "--num-samples", str(size), "--run-dir", folder)
         recording.run_script(["pretrain_pidm.py", *words, "--force", *PRETRAIN])
@@ -193,8 +193,11 @@ def transitions(dataset, index):
     return ppo_explore.Transitions(*map(jnp.asarray, arrays))
 
 
-def measure_novelty(env, dataset, path):
-    """Disagreement of an ensemble trained on the first tenth of a collection, there and on the last tenth."""
+def draw_novelty(env, dataset, path):
+    """Draw the disagreement of an ensemble that is trained on the first tenth of a collection, there and on the last.
+
+    Returns both at the end, by name.
+    """
     rng, tenth = np.random.default_rng(0), len(dataset.train) // 10
     index = {"seen": rng.permutation(dataset.train[:tenth])[:50_000], "novel": dataset.train[-tenth:]}
     known = transitions(dataset, index["seen"])
@@ -251,9 +254,7 @@ def look(robot):
     }
     folder = ROOT / f"results/pidm/{robot}"
     coverage = {f"joint space, {name}": occupied(env, x) for name, x in kinds.items()}
-    coverage |= measure_novelty(
-        env, pretrain_pidm.Dataset(ROOT / f"runs/explore/{robot}/seed0"), folder / "novelty.png"
-    )
+    coverage |= draw_novelty(env, pretrain_pidm.Dataset(ROOT / f"runs/explore/{robot}/seed0"), folder / "novelty.png")
     for task in [task for task in tasks if (ROOT / f"results/tasks/{task}/policy.msgpack").exists()][:1]:
         coverage[f"normalized_error, recorded policy of {task}"] = walking_error(robot, task)
     name, points = project([x[::5] for x in kinds.values()])
@@ -352,7 +353,7 @@ def write_readme():
 def make(robot, stages):
     """Run these stages for a robot."""
     if "collect" in stages:
-        recording.run_script(["ppo_explore.py", "--robot", robot, "--force", *EXPLORE])
+        recording.run_script(["ppo_explore.py", "--robot", robot, "--force", *EXPLORE_FLAGS])
     if "pretrain" in stages:
         words = ("--data", f"runs/explore/{robot}/seed0", "--force", *PRETRAIN)
         recording.run_script(["pretrain_pidm.py", *words])
