@@ -8,10 +8,20 @@ import numpy as np
 
 from experiment import figures
 from results import measures
-from results.grid import ANYMAL, GO1, METHODS, SCALES, SLOW_PIDMS, TABLE_1, TASKS
+from results.grid import (
+    METHODS,
+    MODULES,
+    SLOW_PIDMS,
+    TABLE_1,
+    TASKS,
+    WALKING,
+    batch,
+    by_scale,
+    is_unscaled,
+    title,
+    titled,
+)
 
-WALKING = GO1 + ANYMAL  # tasks that are run at several batches
-MODULES = ("intention_encoder", "history_encoder", "backbone", "action_synthesizer")  # of the actor
 COLOURS = {  # of a method; dashed if only its initial weights or largest step size differ
     "mlp": "#009E73",
     "pidm_random": "#0072B2",
@@ -57,23 +67,6 @@ def legend_below(fig, axes, note, columns=4):
 
 
 SHADE = "thick: mean over seeds; thin: each seed, of up to three; shaded: ± one standard deviation, of four or more"
-
-
-def batch(runs):
-    """Environments x steps of a rollout of a task's runs as text, empty if there are none."""
-    settings = next((arm[0]["settings"] for arm in runs.values()), None)
-    return "{num_envs} x {num_steps}".format(**settings) if settings else ""
-
-
-def title(task, runs):
-    """Title of a task, which says so if its runs were made before the task was changed."""
-    earlier = any(run.get("earlier") for arm in runs.values() for run in arm)
-    return TASKS.get(task, task) + " (earlier task)" * earlier
-
-
-def titled(task, runs):
-    """Title of a task with the batch of its runs."""
-    return f"{title(task, runs)}, {batch(runs)}"
 
 
 def draw_task(ax, heading, runs, methods, extra=None):
@@ -227,15 +220,6 @@ def draw_sizes(study, path, errors):
     return True
 
 
-def by_scale(loaded, task):
-    """Runs of a task at each scale that has both PIDMs (scale -> runs), the smallest batch first as in grid.py."""
-    return {
-        scale: study[task]
-        for scale, study in loaded.items()
-        if {"pidm_random", "pidm_pretrained"} <= study.get(task, {}).keys()
-    }
-
-
 def curves_by_scale(loaded):
     """Title -> runs of the walking quadrupeds that were run at several scales."""
     return {
@@ -244,11 +228,6 @@ def curves_by_scale(loaded):
         for scale, runs in by_scale(loaded, task).items()
         if len(by_scale(loaded, task)) > 1
     }
-
-
-def is_unscaled(scale):
-    """Whether the first mean actions of the main methods are as PyTorch's weights make them, not almost 0."""
-    return SCALES[scale].weights == "pytorch_unscaled"
 
 
 CRITIC = {

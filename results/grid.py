@@ -74,6 +74,8 @@ METHODS = {
     "pidm_pretrained_unscaled": Method("PIDM pretrained, unscaled", "beyond the paper", f"{SHIPPED} {UNSCALED}"),
 }
 
+MODULES = ("intention_encoder", "history_encoder", "backbone", "action_synthesizer")  # of the actor
+
 
 def titles(*groups):
     """Title of each method of these groups, by name."""
@@ -84,6 +86,7 @@ GO1, ANYMAL, G1, PEDIPULATION = ("go1_loco",), ("anymal_loco",), ("g1_loco",), (
 CLIMB_UP, CLIMB_DOWN = ("anymal_climb_up",), ("anymal_climb_down",)
 OTHERS = ("anymal_parkour_walk", "anymal_crouch", "anymal_jump")
 SKILLS = OTHERS + CLIMB_UP + CLIMB_DOWN
+WALKING = GO1 + ANYMAL  # tasks that are run at several batches
 
 TABLE_1, TABLE_2, PARTS = (tuple(titles(group)) for group in ("table 1", "table 2", "sizes"))
 PIDMS = ("pidm_random", "pidm_pretrained")
@@ -141,6 +144,37 @@ PLAN = (  # in the order in which it is run
 def is_earlier(scale, task):
     """Whether the runs of a task at a scale were made before the task was changed."""
     return scale in SCALES and task in SCALES[scale].earlier
+
+
+def batch(runs):
+    """Environments x steps of a rollout of a task's runs as text, empty if there are none."""
+    settings = next((arm[0]["settings"] for arm in runs.values()), None)
+    return "{num_envs} x {num_steps}".format(**settings) if settings else ""
+
+
+def title(task, runs):
+    """Title of a task, which says so if its runs were made before the task was changed."""
+    earlier = any(run.get("earlier") for arm in runs.values() for run in arm)
+    return TASKS.get(task, task) + " (earlier task)" * earlier
+
+
+def titled(task, runs):
+    """Title of a task with the batch of its runs."""
+    return f"{title(task, runs)}, {batch(runs)}"
+
+
+def by_scale(loaded, task):
+    """Runs of a task at each scale that has both PIDMs (scale -> runs), the smallest batch first as in grid.py."""
+    return {
+        scale: study[task]
+        for scale, study in loaded.items()
+        if {"pidm_random", "pidm_pretrained"} <= study.get(task, {}).keys()
+    }
+
+
+def is_unscaled(scale):
+    """Whether the first mean actions of the main methods are as PyTorch's weights make them, not almost 0."""
+    return SCALES[scale].weights == "pytorch_unscaled"
 
 
 # Fields that the config of an older run lacks, at the values that leave its task as it was.

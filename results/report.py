@@ -25,7 +25,7 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 
 from experiment import figures, records
-from results import drawing, tables
+from results import drawing, grid, tables
 from results.grid import CONTROLS, METHODS, SCALES, TABLE_1, TASKS, task_of, titles
 
 STUDY = ROOT / "results/study"
@@ -149,7 +149,7 @@ def draw_all(loaded):
     study = pick(loaded)
     drawn = {
         "curves": lambda path: drawing.draw_curves(
-            {drawing.titled(task, runs): runs for task, runs in study.items()}, path
+            {grid.titled(task, runs): runs for task, runs in study.items()}, path
         ),
         "curves_batch": lambda path: drawing.draw_curves(drawing.curves_by_scale(loaded), path),
         "controls": lambda path: drawing.draw_controls(pick(loaded, CONTROLS), path),
@@ -180,7 +180,7 @@ def compare(folder):
         rows = [{"against PIDM random": METHODS[m].title} | tables.compared(task, runs, m) for m in others]
         print("\n".join(["", *tables.markdown(tables.without_empty(rows) if rows else [])]))
     path = folder / "curves.png"
-    drawing.draw_curves({drawing.titled(task, runs): runs}, path, tuple(METHODS))
+    drawing.draw_curves({grid.titled(task, runs): runs}, path, tuple(METHODS))
     print(f"wrote {path}")
 
 
@@ -202,14 +202,14 @@ def beside(folder):
 
     def likeness(runs):
         (one, *_), *_ = runs.values()
-        return one["settings"]["config"] == config, drawing.batch(runs) == "{num_envs} x {num_steps}".format(**args)
+        return one["settings"]["config"] == config, grid.batch(runs) == "{num_envs} x {num_steps}".format(**args)
 
     runs = max(known, key=likeness)
     if not likeness(runs)[0]:
         print(f"the recorded runs of {task} had other numbers in its config")
     name = next(iter(runs.values()))[0]["settings"]["indicator"]
     path, this = folder / "beside_recorded.png", ("this run", iterations, [row[name] for row in rows])
-    drawing.draw_curves({drawing.titled(task, runs): runs}, path, tuple(METHODS), this)
+    drawing.draw_curves({grid.titled(task, runs): runs}, path, tuple(METHODS), this)
     print(f"wrote {path}")
 
 

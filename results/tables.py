@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from experiment import records
-from results import drawing, measures
+from results import grid, measures
 from results.grid import METHODS, SCALES, TABLE_1, TASKS, is_earlier, task_of
 from results.measures import MEASURES
 
@@ -181,7 +181,7 @@ def table_1(study, tasks=tuple(TASKS)):
     rows = []
     for task in tasks:
         runs = study.get(task, {})
-        row = {"task": drawing.title(task, runs), "batch": drawing.batch(runs), "seeds": measures.seeds(runs, TABLE_1)}
+        row = {"task": grid.title(task, runs), "batch": grid.batch(runs), "seeds": measures.seeds(runs, TABLE_1)}
         for i, (head, method, name) in enumerate(columns):
             found = measures.compare(task, runs, method, name)
             row |= {head: shown(found), "paper" + " " * i: paper(method, name, task)}
@@ -220,7 +220,7 @@ def along_the_way(study):
     for task, runs in study.items():
         if "pidm_random" not in runs:
             continue
-        row = {"task": drawing.title(task, runs)}
+        row = {"task": grid.title(task, runs)}
         row |= {head: shown(measures.compare(task, runs, method, name)) for head, method, name in columns}
         for head, method, name in columns_of({"mean action": "mean action"}):
             row[head] = shown(measures.compare(task, runs, method, name), "")
@@ -266,7 +266,7 @@ def controls(loaded):
         for runs, (method, against) in itertools.product(studies, PAIRS):
             if arms := measures.same_seeds(runs, method, against):
                 devices = {on_cpu(run) for arm in arms.values() for run in arm}
-                row = {"task": drawing.title(task, runs), "batch": drawing.batch(runs) + " *" * (len(devices) > 1)}
+                row = {"task": grid.title(task, runs), "batch": grid.batch(runs) + " *" * (len(devices) > 1)}
                 row |= {"method": METHODS[method].title, "against": METHODS[against].title}
                 row["seeds"] = ", ".join(str(run["seed"]) for run in arms[method])
                 row |= compared(task, arms, method, against)
@@ -290,7 +290,7 @@ def against_mlp(study):
     """The pretrained PIDM against the MLP on each task; the 90% are the MLP's."""
     return markdown(
         [
-            {"task": drawing.title(task, runs), "seeds": measures.seeds(runs, ("pidm_pretrained", "mlp"))}
+            {"task": grid.title(task, runs), "seeds": measures.seeds(runs, ("pidm_pretrained", "mlp"))}
             | compared(task, runs, "pidm_pretrained", "mlp")
             for task, runs in study.items()
             if {"pidm_pretrained", "mlp"} <= runs.keys()
@@ -304,7 +304,7 @@ def gait_table(study):
     for task, runs in study.items():
         for method, arm in runs.items():
             if mine := [run["gait"] for run in arm if run["gait"]]:
-                row = {"task": drawing.title(task, runs), "method": METHODS[method].title, "seeds": str(len(mine))}
+                row = {"task": grid.title(task, runs), "method": METHODS[method].title, "seeds": str(len(mine))}
                 for name, title in GAIT.items():
                     episodes = name.replace("falls", "episodes")
                     known = [gait for gait in mine if gait[name] is not None]
@@ -325,10 +325,10 @@ def early_updates(runs, method, against):
 def batches_table(loaded):
     """What pretraining brings at each scale of a walking quadruped, of those with several; and what the MLP does."""
     rows = []
-    for task in drawing.WALKING:
-        found = drawing.by_scale(loaded, task)
+    for task in grid.WALKING:
+        found = grid.by_scale(loaded, task)
         for scale, runs in found.items() if len(found) > 1 else ():
-            row = {"task": TASKS[task], "batch": drawing.batch(runs), "initial weights": SCALES[scale].weights}
+            row = {"task": TASKS[task], "batch": grid.batch(runs), "initial weights": SCALES[scale].weights}
             row["seeds"] = measures.seeds(runs, TABLE_1)
             for method in ("pidm_pretrained", "mlp"):
                 title = METHODS[method].title.removeprefix("PIDM ")
@@ -347,10 +347,10 @@ def updates_table(study):
             continue
         ratio = {
             name: measures.early_ratio(name, runs["pidm_pretrained"], runs["pidm_random"])
-            for name in ("lr", *(f"update/actor/{module}" for module in drawing.MODULES))
+            for name in ("lr", *(f"update/actor/{module}" for module in grid.MODULES))
         }
         step = ratio.pop("lr")
-        row = {"task": drawing.title(task, runs), "seeds": measures.seeds(runs, ("pidm_pretrained", "pidm_random"))}
+        row = {"task": grid.title(task, runs), "seeds": measures.seeds(runs, ("pidm_pretrained", "pidm_random"))}
         row |= {name.split("/")[-1].replace("_", " "): f"{100 * (x - 1):+z.0f}" for name, x in ratio.items()}
         row |= {"step size": f"{100 * (step - 1):+z.0f}"}
         row |= {"backbone per step size": f"{100 * (ratio['update/actor/backbone'] / step - 1):+z.0f}"}
@@ -365,7 +365,7 @@ def progress_table(study):
         goal = measures.goal_of(runs["pidm_random"]) if "pidm_random" in runs else None
         for method, mine in runs.items():
             each = {name: measures.values(name, mine, goal) for name in ("final", "area")}
-            row = {"task": drawing.title(task, runs), "method": METHODS[method].title}
+            row = {"task": grid.title(task, runs), "method": METHODS[method].title}
             row["seeds"] = ", ".join(str(run["seed"]) for run in mine)
             row["final"] = spread(each["final"])
             row["gained in the last third [%]"] = f"{100 * np.mean([measures.late_gain(run) for run in mine]):.0f}"
@@ -391,7 +391,7 @@ def actions_table(study):
     )
     for task, runs in chosen.items():
         for method, mine in runs.items():
-            row = {"task": drawing.title(task, runs), "method": METHODS[method].title, "seeds": str(len(mine))}
+            row = {"task": grid.title(task, runs), "method": METHODS[method].title, "seeds": str(len(mine))}
             for name in names:
                 known = [run["errors"][name] for run in mine if name in run["errors"]]
                 row[name.replace("_", " ")] = f"{np.mean(known):.3g}" if known else ""
@@ -404,10 +404,10 @@ def sizes_and_machines(study):
     lines = []
     for task, runs in study.items():
         one = next(iter(runs.values()))[0]
-        size = f"{drawing.batch(runs)}, {one['settings']['total_steps'] / 1e6:.1f} M steps"
+        size = f"{grid.batch(runs)}, {one['settings']['total_steps'] / 1e6:.1f} M steps"
         each = [run["versions"] for arm in runs.values() for run in arm]
         machines = sorted({"{device}, {machine}, jax {jax}".format(**versions) for versions in each})
-        lines.append(f"- {drawing.title(task, runs)}: `{task}`, {size}, {'; '.join(machines)}")
+        lines.append(f"- {grid.title(task, runs)}: `{task}`, {size}, {'; '.join(machines)}")
     return lines
 
 

@@ -12,7 +12,7 @@ import pytest
 from scipy import stats
 
 from experiment import records
-from results import drawing, measures, pidm, report, tables, tasks
+from results import drawing, grid, measures, pidm, report, tables, tasks
 from tools import bench
 
 
@@ -265,7 +265,7 @@ def test_updates_are_of_the_first_iterations_and_also_per_step_size():
 
     def run(scale, step):
         iteration = np.array([50.0, 100.0, 150.0])
-        columns = {f"update/actor/{module}": scale * np.array([1.0, 3.0, 99.0 / scale]) for module in drawing.MODULES}
+        columns = {f"update/actor/{module}": scale * np.array([1.0, 3.0, 99.0 / scale]) for module in grid.MODULES}
         return {"iteration": iteration, "columns": columns | {"lr": step * np.array([1.0, 1.0, 7.0 / step])}}
 
     table = tables.updates_table({"go1_loco": {"pidm_random": [run(1.0, 4.0)], "pidm_pretrained": [run(0.5, 1.0)]}})
@@ -284,7 +284,7 @@ def test_all_machines_of_a_task_are_named():
 def test_rows_of_earlier_tasks_are_marked():
     """Jumping was run before its task was changed; climbing up before and after."""
     titles = [
-        drawing.title(task, tables.load_task(report.ROOT / f"results/study/{scale}/{task}"))
+        grid.title(task, tables.load_task(report.ROOT / f"results/study/{scale}/{task}"))
         for scale, task in (("cpu", "anymal_jump"), ("cpu", "anymal_climb_up"), ("batch", "anymal_climb_up"))
     ]
     assert titles == ["Jump (earlier task)", "Climb up (earlier task)", "Climb up"]
