@@ -376,6 +376,20 @@ def test_words_of_the_page_are_what_was_recorded():
     assert f"costs Go1 {100 * (1 - with_loaded / without):.1f}%" in text
 
 
+def test_words_on_shuffled_weights_are_what_was_recorded():
+    """With 4096 environments, one seed of each robot, against the same seeds of both PIDMs."""
+    text, found = " ".join((report.ROOT / "results/README.md").read_text().split()), []
+    for task in ("go1_loco", "anymal_loco"):
+        shuffled, random, loaded = (recorded(task, f"pidm_{m}", "batch") for m in ("shuffled", "random", "pretrained"))
+        assert len(shuffled) == 1, "(n = 1 each)"
+        ends = [runs[0, -7:].mean() for runs in (shuffled, random, loaded)]
+        found.append([100 * (a / b - 1) for a, b in ((ends[0], ends[1]), (ends[2], ends[0]))])
+    (up, left), (other, rest) = found
+    said = f"they end {up:.1f}% (Go1) and {other:.1f}% (ANYmal D) above PIDM random, the pretrained PIDM "
+    assert said + f"{left:.1f}% and {rest:.1f}% above them" in text
+    assert f"Shuffled weights bring Go1 {up:.1f}% (n = 1)." in text
+
+
 def test_words_on_orthogonal_weights_are_what_was_recorded():
     """What pretraining adds to them with 4096 environments."""
     text, adds = " ".join((report.ROOT / "results/README.md").read_text().split()), []
@@ -525,7 +539,7 @@ def test_words_on_noise_are_what_was_recorded():
     gains, found = [], {}
     for task in ("go1_loco", "anymal_loco"):
         of = {m: np.array([one["episode_return"] for one in evaluations("batch", task, m)]) for m in methods}
-        means = {m: each.mean() for m, each in of.items() if len(each)}  # Go1 has no shuffled weights here
+        means = {m: each.mean() for m, each in of.items() if len(each)}
         mlp, random, loaded, slow, loaded_slow = (means[m] for m in methods if m != "pidm_shuffled")
         pairs = (loaded, random), (mlp, random), (slow, of["pidm_random"][:2].mean()), (loaded_slow, slow)
         gains.append([f"{100 * (a / b - 1):.1f}%" for a, b in pairs])
@@ -558,19 +572,20 @@ def test_words_on_gaits_are_what_was_recorded():
         return [json.loads(path.read_text())["gait"] for path in sorted(found)]
 
     loaded = gaits("pidm_pretrained", "pidm_pretrained_slow")
-    others = gaits("mlp", "pidm_random", "pidm_random_slow")
-    assert (len(loaded), len(others)) == (5, 8)
+    others = gaits("mlp", "pidm_random", "pidm_random_slow", "pidm_shuffled")
+    assert (len(loaded), len(others)) == (5, 9)
     lift, slip = (
         [f(run[name] for run in runs) for runs in (loaded, others) for f in (min, max)]
         for name in ("clearance", "slip")
     )
     assert lift[0] > lift[3] and slip[1] < slip[2]
-    said = "lift their feet by {:.1f} to {:.1f} mm and slip {:.3f} to {:.3f} m a metre; all eight of MLPs and random "
-    said += "PIDMs {:.1f} to {:.1f} mm and {:.3f} to {:.3f}."
+    said = "lift their feet by {:.1f} to {:.1f} mm and slip {:.3f} to {:.3f} m a metre; all nine of MLPs, random "
+    said += "and shuffled PIDMs {:.1f} to {:.1f} mm and {:.3f} to {:.3f}."
     lift = [1000 * x for x in lift]
     assert said.format(*lift[:2], *slip[:2], *lift[2:], *slip[2:]) in text
-    few = [1000 * gaits(f"pidm_{m}", scale="256")[0]["clearance"] for m in ("pretrained", "random")]
-    assert "With 256 (n = 1) it is {:.0f} against {:.0f} mm.".format(*few) in text
+    few = [gaits(f"pidm_{m}", scale="256") for m in ("pretrained", "random")]
+    few = [1000 * np.mean([run["clearance"] for run in runs]) for runs in few]
+    assert "With 256 (n = 2) it is {:.0f} against {:.0f} mm.".format(*few) in text
     arms = ("pidm_pretrained", "pidm_random", "mlp", "pidm_pretrained_slow", "pidm_random_slow")
     falls = [sum(run["push of 1.0 m/s/falls"] for run in gaits(m)) for m in arms]
     said = "fells Go1's pretrained PIDM in {:.0f} of 120 episodes, PIDM random in {:.0f}, the MLP in {:.0f}; "
@@ -597,8 +612,9 @@ def test_words_on_feet_and_first_actions_are_what_was_recorded():
         there = [np.mean([1 + np.argmax(run >= 0.9 * final[1]) for run in arm]) for arm in arms]
         gains.append(100 * (final[0] / final[1] - 1))
         later.append(100 * (there[0] / there[1] - 1))
-    said = f"Go1 gains {gains[0]:.1f}% after {later[0]:.0f}% more iterations (n = {counts[0]}), "
-    assert said + f"ANYmal D {gains[1]:.1f}% after {-later[1]:.0f}% fewer (n = {counts[1]})." in text
+    assert counts == [2, 2]
+    said = f"with small ones (n = 2) Go1 gains {gains[0]:.1f}% after {later[0]:.0f}% more iterations, "
+    assert said + f"ANYmal D {gains[1]:.1f}% after {-later[1]:.0f}% fewer." in text
     assert f"and {gains[1]:.1f}% with small first actions (n = {counts[1]})" in text
     said = f"{gains[1]:.0f}% higher, in {-later[1]:.0f}% fewer (n = {counts[1]}). Go1 ends alike; with small ones it "
     assert said + f"needs {later[0]:.0f}% more." in " ".join((report.ROOT / "README.md").read_text().split())
