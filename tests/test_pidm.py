@@ -524,14 +524,14 @@ def test_first_actions_wherever_the_first_rollout_gets(name, start_from, weight_
     assert actions.shape[:2] == (24, 16) and 0 < np.abs(actions).max() < 0.02
 
 
-@pytest.mark.parametrize("name", ["anymal_loco", "go1_loco", "g1_loco"])
-def test_first_actions_with_an_unscaled_last_layer(name, jitted, first_rollout):
-    """Root mean square of a warm-started actor's actions: 0.18 to 0.28 in results/pidm, of one initialisation each."""
+@pytest.mark.parametrize(("name", "size"), [("anymal_loco", 0.18), ("go1_loco", 0.23), ("g1_loco", 0.27)])
+def test_first_actions_with_an_unscaled_last_layer(name, size, jitted, first_rollout):
+    """Root mean square of a warm-started actor's actions, for this draw of the rest; results/pidm has 0.18 to 0.28."""
     env = jitted(name).env
     path = finetune.SHIPPED / f"{env.robot.name}.msgpack"
     changes = {"pretrained": str(path), "weight_init": "pytorch_unscaled"}
     actions = first_actions(env, first_rollout(name), name, **changes)
-    assert 0.1 < (actions**2).mean() ** 0.5 < 0.4
+    assert (actions**2).mean() ** 0.5 == pytest.approx(size, abs=0.05)
 
 
 def layers_of(params):
