@@ -22,7 +22,7 @@ import tyro
 import envs
 import ppo_finetune
 from envs.locomotion import Locomotion
-from experiment import gait, metrics, records
+from experiment import checkpoints, gait, metrics, records, walks
 from experiment.run import make_env, typed
 
 
@@ -51,7 +51,7 @@ def load_policy(path, engine="auto", overrides=(), **fields):
 
     The environment has the --set of the training, then `fields` of its config, then `overrides` (NAME=VALUE).
     """
-    params, meta = records.load(Path(path), "policy")
+    params, meta = checkpoints.load(Path(path), "policy")
     trained = {name: meta["args"].get(name) for name in ("network", "init_std", "hidden", "intention")}
     args = ppo_finetune.Args(task=meta["task"], engine=engine, set=tuple(overrides), **trained)
     make = partial(envs.make, robust=meta["args"].get("robust", False), robot=meta.get("body"))
@@ -59,13 +59,13 @@ def load_policy(path, engine="auto", overrides=(), **fields):
     net = ppo_finetune.make_net(args, env)
     state = jax.eval_shape(env.reset, jax.random.key(0))
     like = jax.eval_shape(net.init, jax.random.key(0), net.inputs(state.obs, state.history))
-    records.check_shapes(path, params, like)
+    checkpoints.check_shapes(path, params, like)
     return env, net, params, meta
 
 
 def load(args, kind="EVALUATION_FIELDS", **fields):
     """Load the policy for evaluation or, with SHOWCASE_FIELDS, for pictures. UserError if task or level is unknown."""
-    _, meta = records.load(Path(args.policy), "policy")
+    _, meta = checkpoints.load(Path(args.policy), "policy")
     family = envs.family(meta["task"])
     if family is None:
         known = ", ".join(envs.TASKS | envs.OWN | envs.GENERIC)
@@ -77,6 +77,12 @@ def load(args, kind="EVALUATION_FIELDS", **fields):
     if "level" in fields and args.level is not None:
         fields["level"] = args.level
     return load_policy(args.policy, args.engine, args.set, **fields)
+
+
+def load_nominal(path, engine="auto", overrides=(), seconds=gait.SECONDS):
+    """Load a policy for walks of so many seconds, which no episode ends, whatever the overrides say."""
+    kept = [word for word in overrides if not word.startswith("episode_seconds=")]
+    return load_policy(path, engine, kept, **walks.NOMINAL, episode_seconds=seconds + 1)
 
 
 # --- Evaluation ---
@@ -135,10 +141,8 @@ def run_evaluation(args):
     print(f"showcase {fields}:", records.line(shown))
     report = jax.tree.map(float, report | {"showcase": shown}) | {"showcase_config": fields}
     if isinstance(env, Locomotion):
-        from tools import gait as walks  # it imports this file
-
-        few = {"starts": min(max(args.episodes // 3, 1), 20), "engine": args.engine}
-        by_command, report["gait"] = walks.evaluate(walks.Args(args.policy, args.set, **few))
+        walker = load_nominal(args.policy, args.engine, args.set)[:3]
+        by_command, report["gait"] = walks.evaluate(*walker, starts=min(max(args.episodes // 3, 1), 20))
         print(gait.lines(by_command, report["gait"]))
     folder = Path(args.policy).parent
     records.replace_text(folder / "eval.json", json.dumps(report, indent=1) + "\n")

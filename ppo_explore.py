@@ -22,7 +22,7 @@ import optax
 import tyro
 
 import envs
-from experiment import dataset, devices, figures, metrics, records
+from experiment import arguments, checkpoints, dataset, devices, figures, metrics, records
 from experiment.run import Run, make_env, planned_iterations
 
 jax.config.update("jax_default_matmul_precision", "highest")  # TF32 of recent GPUs changes what is learned
@@ -97,7 +97,7 @@ def merge(args, ppo):
     values = PRESETS[args.preset] | {"hidden": ppo["hidden"], "init_std": ppo["init_std"]}
     values |= {"entropy_coef": ppo["entropy"], "shuffle_blocks": jax.device_count()}
     values |= {"run_dir": f"runs/explore/{envs.label(args.robot)}/seed{args.seed}"}
-    args = records.check_minibatches(records.filled(args, values))
+    args = arguments.check_minibatches(arguments.filled(args, values))
     if not 0 < args.validation < 1 or num_held_out(args) == args.num_envs:
         raise records.UserError(f"--validation {args.validation} of {args.num_envs} environments leaves a split empty")
     if args.members == 1 and args.policy == "explore":
@@ -571,7 +571,7 @@ def explore(args):
             for name, array in arrays.items():
                 array[run.iteration : run.iteration + args.log_every] = data[name]
             run.log(state.iteration, [report])
-            if not records.finite((state.params, state.ensemble)):
+            if not checkpoints.finite((state.params, state.ensemble)):
                 raise records.UserError(
                     f"weights are not finite after iteration {run.iteration}; lower --lr or --ensemble-lr"
                 )
@@ -592,7 +592,7 @@ def main(args):
     """Collect data. User errors print one line and exit with code 2."""
     with records.one_line_errors():
         devices.join(args.distributed)
-        return explore(records.resumed(args) if args.resume else args)
+        return explore(arguments.resumed(args) if args.resume else args)
 
 
 if __name__ == "__main__":

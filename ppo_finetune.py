@@ -21,7 +21,7 @@ import optax
 import tyro
 
 import envs
-from experiment import devices, metrics, records
+from experiment import arguments, checkpoints, devices, metrics, records
 from experiment.run import Run, make_env, planned_iterations, stack, unstack
 
 SHIPPED = Path(__file__).parent / "assets/pidm"  # <robot>.msgpack: pretrained weights and input normalisation
@@ -102,7 +102,7 @@ def merge(args, ppo):
     values |= {"hidden": ppo["hidden"], "intention": ppo.get("intention"), "lr": 1e-4 if args.policy else 1e-3}
     values |= {"init_std": ppo["init_std"], "entropy_coef": ppo["entropy"], "desired_kl": ppo.get("desired_kl", 0.01)}
     values |= {"shuffle_blocks": jax.device_count()} | PRESETS[args.preset] | ppo.get(args.preset, {})
-    return records.check_minibatches(records.filled(args, values))
+    return arguments.check_minibatches(arguments.filled(args, values))
 
 
 # --- Networks ---
@@ -288,7 +288,7 @@ def warm_start(args, env, params, key):
     """
     path = Path(args.pretrained or SHIPPED / f"{env.robot.name}.msgpack")
     core = {name: params["params"]["actor"][name] for name in ("history_encoder", "backbone")}
-    pidm = records.load_pidm(path, env, {"params": core, "normalizer": params["normalizer"]})
+    pidm = checkpoints.load_pidm(path, env, {"params": core, "normalizer": params["normalizer"]})
     core = jax.tree.map(jnp.asarray, pidm["params"])
     if args.load_into == "shuffled":
         core = shuffle_weights(core, key)
@@ -511,7 +511,7 @@ def init_state(args, env, net, opt):
     if args.weight_init == "pytorch":  # orthogonal last layers are small already, pytorch_unscaled keeps PyTorch's
         shrink_first_actions(params)
     if args.policy and not args.resume:  # a saved state replaces the weights
-        params = records.load_networks(args.policy, params, env)
+        params = checkpoints.load_networks(args.policy, params, env)
     elif args.network == "pidm" and not args.resume:
         params = warm_start(args, env, params, k_load)
     return TrainState(params, opt.init(params), jnp.float32(min(args.lr, args.max_lr)), env_state, key, jnp.int32(0))
@@ -553,7 +553,7 @@ def main(args):
     """Train. User errors print one line and exit with code 2."""
     with records.one_line_errors():
         devices.join(args.distributed)
-        return train(records.resumed(args, "total_steps") if args.resume else args)
+        return train(arguments.resumed(args, "total_steps") if args.resume else args)
 
 
 if __name__ == "__main__":

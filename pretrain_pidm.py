@@ -24,7 +24,7 @@ import optax
 import tyro
 
 from envs.base import NOISE, PROP
-from experiment import dataset, devices, figures, metrics, records
+from experiment import arguments, checkpoints, dataset, devices, figures, metrics, records
 from experiment.run import Run
 
 jax.config.update("jax_default_matmul_precision", "highest")  # TF32 of recent GPUs changes what is learned
@@ -67,7 +67,7 @@ SHOWN = ("train_error", "error", "normalized_error", "last_action_error")  # col
 
 def merge(args, robot):
     """Fill the fields left at None from the preset, and check the result."""
-    args = records.filled(args, PRESETS[args.preset] | {"run_dir": f"runs/pidm/{robot}/seed{args.seed}"})
+    args = arguments.filled(args, PRESETS[args.preset] | {"run_dir": f"runs/pidm/{robot}/seed{args.seed}"})
     if args.batch % jax.device_count():
         raise records.UserError(f"--batch {args.batch} cannot be split over {jax.device_count()} devices")
     if args.patience and args.patience >= args.epochs:
@@ -358,14 +358,14 @@ def pretrain(args):
             if not np.isfinite(loss + row["error"]):
                 raise records.UserError(f"the error is not finite after epoch {epoch}; lower --lr")
             if folder and row["error"] == min(val_errors):
-                records.save(folder / "pidm.msgpack", state[0], checkpoint_meta(args, env, data, net.sizes, row))
+                checkpoints.save(folder / "pidm.msgpack", state[0], checkpoint_meta(args, env, data, net.sizes, row))
             run.save([state])
     run.report_interrupt()
     if folder:
         panels = {"normalized_error": ["normalized_error"], "L1": ["train_error", "error"]}
         figures.plot_curves(run.rows[0], panels, folder / "curve.png", over="samples")
         print(f"wrote {folder}/pidm.msgpack, metrics.csv, curve.png")
-        best, _ = records.load(folder / "pidm.msgpack", "PIDM checkpoint")
+        best, _ = checkpoints.load(folder / "pidm.msgpack", "PIDM checkpoint")
         validate(predictor, env, best, data, folder)
 
 
@@ -456,14 +456,14 @@ def run_validation(args):
     data, env = open_data(args)
     net = PIDM(SIZES[env.robot.like], env.action_dim)
     like = jax.eval_shape(partial(init_variables, args, env, net), data.windows(data.validation[:1]))
-    validate(make_predictor(args, env, net), env, records.load_pidm(path, env, like), data, path.parent)
+    validate(make_predictor(args, env, net), env, checkpoints.load_pidm(path, env, like), data, path.parent)
 
 
 def main(args):
     """Train a PIDM, or validate one. User errors print one line and exit with code 2."""
     with records.one_line_errors():
         devices.join(args.distributed)
-        return run_validation(args) if args.eval else pretrain(records.resumed(args) if args.resume else args)
+        return run_validation(args) if args.eval else pretrain(arguments.resumed(args) if args.resume else args)
 
 
 if __name__ == "__main__":

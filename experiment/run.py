@@ -19,7 +19,7 @@ import jax.numpy as jnp
 
 from envs import loader
 from envs.config import FIXED
-from experiment import devices, figures, metrics, records
+from experiment import arguments, checkpoints, devices, figures, metrics, records
 from experiment.progress import Progress
 
 
@@ -79,12 +79,12 @@ class Run:
             print("\n".join(loader.lines(self.body)), flush=True)
         if self.args.resume:
             records.claim(self.args.resume)
-            state, self.rows[0] = records.load_state(self.args.resume, jax.eval_shape(lambda: init(self.args)))
+            state, self.rows[0] = checkpoints.load_state(self.args.resume, jax.eval_shape(lambda: init(self.args)))
             self.iteration = int(self.rows[0][-1]["iteration"]) if self.rows[0] else 0
             if self.iteration > self.total:
                 raise records.UserError(f"{self.args.resume} has more than {self.args.total_steps} steps already")
             if devices.is_first():
-                records.extend(self.args)
+                arguments.extend(self.args)
             if self.done:
                 print(f"{self.args.resume} has all its rows already; nothing is left to train")
             return [state]
@@ -148,7 +148,7 @@ class Run:
         If weights are not finite, save the state `before` the last chunk and raise a UserError.
         """
         for args, folder, params in zip(self.each_args, self.folders, unstack(states.params), strict=True):
-            if not records.finite(params):
+            if not checkpoints.finite(params):
                 self.rows = [rows[:-1] for rows in self.rows]
                 self.save(unstack(before))
                 raise records.UserError(
@@ -157,7 +157,7 @@ class Run:
                 )
             if folder:
                 meta = {"task": args.task, "args": dataclasses.asdict(args), "body": self.body}
-                records.save(folder / "policy.msgpack", params, meta)
+                checkpoints.save(folder / "policy.msgpack", params, meta)
         if self.due:
             self.save(unstack(states))
 
@@ -165,7 +165,7 @@ class Run:
         """Write what --resume needs, a state for each seed. Skipped with several processes: none holds all."""
         if jax.process_count() == 1:
             for folder, state, rows in zip(self.folders, states, self.rows, strict=True):
-                records.save_state(folder, state, rows)
+                checkpoints.save_state(folder, state, rows)
         self.saved = time.perf_counter()
 
     def finish(self, states):

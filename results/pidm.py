@@ -34,7 +34,7 @@ import play
 import ppo_explore
 import ppo_finetune
 import pretrain_pidm
-from experiment import devices, figures, records
+from experiment import checkpoints, devices, figures, records
 from results import recording
 
 PART_SIZES = (7_000, 70_000, 700_000)  # transitions; the fourth of the paper's sizes, 7 M, is the whole collection
@@ -124,7 +124,7 @@ def walking_error(robot, task, num_envs=256, steps=200):
     """Normalised error of the shipped PIDM on the recorded policy of `task`, with noise on actions and sensors."""
     env, net, params, _ = play.load_policy(ROOT / f"results/tasks/{task}/policy.msgpack", "c")
     pidm = pretrain_pidm.PIDM(pretrain_pidm.SIZES[robot], env.action_dim)
-    weights, _ = records.load(ROOT / f"assets/pidm/{robot}.msgpack", "PIDM checkpoint")
+    weights, _ = checkpoints.load(ROOT / f"assets/pidm/{robot}.msgpack", "PIDM checkpoint")
 
     def step(state, key):
         mean, log_std, _ = net.apply(params, net.inputs(state.obs, state.history))

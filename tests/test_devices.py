@@ -16,7 +16,7 @@ import tyro
 import ppo_explore
 import ppo_finetune as script
 import pretrain_pidm
-from experiment import records
+from experiment import checkpoints
 
 ROOT = Path(__file__).resolve().parent.parent
 SMOKE = ("--preset", "smoke", "--engine", "mjx", "--num-envs", "8", "--log-every", "2", "--shuffle-blocks", "2")
@@ -61,7 +61,7 @@ def weights(path, kind):
         for name in sorted(tree):
             collect(tree[name]) if isinstance(tree[name], dict) else leaves.append(np.ravel(tree[name]))
 
-    collect(records.load(path, kind)[0])
+    collect(checkpoints.load(path, kind)[0])
     return np.concatenate(leaves)
 
 

@@ -22,7 +22,7 @@ import play
 import ppo_explore as script
 import ppo_finetune
 import pretrain_pidm
-from experiment import records
+from experiment import checkpoints, records
 from experiment.progress import Progress
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -276,10 +276,10 @@ def test_stages_one_to_three_through_files(collected, tmp_path):
     pidm, run = tmp_path / "pidm", tmp_path / "run"
     pretrain_pidm.main(pretrain_pidm.Args(data=str(collected[0]), preset="smoke", run_dir=str(pidm)))
     args = ppo_finetune.Args(preset="smoke", pretrained=str(pidm / "pidm.msgpack"), run_dir=str(run))
-    _, meta = records.load(pidm / "pidm.msgpack", "PIDM checkpoint")
+    _, meta = checkpoints.load(pidm / "pidm.msgpack", "PIDM checkpoint")
     assert meta["action_scale"] == [0.25] * 12 and meta["dt"] == 0.02
     ppo_finetune.main(args)
-    _, meta = records.load(run / "policy.msgpack", "policy")
+    _, meta = checkpoints.load(run / "policy.msgpack", "policy")
     assert meta["args"]["network"] == "pidm"
     header = (run / "metrics.csv").read_text().splitlines()[0].split(",")
     assert {"update/actor/backbone", "update/actor/intention_encoder", "update/critic/value_synthesizer"} <= set(header)

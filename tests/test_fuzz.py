@@ -19,7 +19,7 @@ import pytest
 import ppo_finetune
 import pretrain_pidm
 from envs.base import PROP
-from experiment import records
+from experiment import arguments, checkpoints, records
 from results import tables
 
 MUTATIONS = 1_000  # of each format
@@ -88,13 +88,13 @@ PARAMS = {"params": {"actor": {"Dense_0": {"kernel": np.ones((3, 2), np.float32)
 def test_checkpoints(tmp_path):
     path, rng, taken = tmp_path / "policy.msgpack", random.Random(0), 0
     meta = {"task": "go1_loco", "args": dataclasses.asdict(ppo_finetune.Args())}
-    records.save(path, PARAMS, meta)
+    checkpoints.save(path, PARAMS, meta)
     whole = path.read_bytes()
     like = jax.tree.map(jnp.asarray, PARAMS)
 
     def read():
-        params, _ = records.load(path, "policy")
-        records.check_shapes(path, params, like)
+        params, _ = checkpoints.load(path, "policy")
+        checkpoints.check_shapes(path, params, like)
 
     assert survive(read)
     for i in range(MUTATIONS):
@@ -109,13 +109,13 @@ def test_checkpoints(tmp_path):
 
 def test_states(tmp_path):
     rng, state = random.Random(1), {"key": jax.random.key(0), "w": jnp.ones((2, 3)), "n": jnp.int32(4)}
-    records.save_state(tmp_path, state, [{"iteration": 1, "reward": 0.5}])
+    checkpoints.save_state(tmp_path, state, [{"iteration": 1, "reward": 0.5}])
     path = tmp_path / records.STATE
     whole = path.read_bytes()
-    assert survive(lambda: records.load_state(tmp_path, state))
+    assert survive(lambda: checkpoints.load_state(tmp_path, state))
     for _ in range(MUTATIONS):
         path.write_bytes(damage(rng, whole))
-        survive(lambda: records.load_state(tmp_path, state))
+        survive(lambda: checkpoints.load_state(tmp_path, state))
 
 
 def test_arguments_of_a_run(tmp_path):
@@ -124,7 +124,7 @@ def test_arguments_of_a_run(tmp_path):
     args, taken = ppo_finetune.Args(resume=str(tmp_path)), 0
 
     def read():
-        found = records.resumed(args)
+        found = arguments.resumed(args)
         ppo_finetune.merge(found, ppo_finetune.envs.TASKS["go1_loco"][1].ppo)
 
     path.write_text(json.dumps(record))

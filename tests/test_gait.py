@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 import envs
-from experiment import gait
+import play
+from experiment import gait, walks
 from tools import gait as tool
 
 TASKS = Path(__file__).resolve().parent.parent / "results/tasks"
@@ -256,7 +257,7 @@ def test_motion_is_seen_in_the_heading_frame(jitted):
     p = state.physics
     qvel = p.qvel.at[0, :6].set(np.array([0.1, 0.7, 0, 0, 0, 2.0]))
     state = state.replace(physics=p.replace(qpos=p.qpos.at[0, 3:7].set(quat), qvel=qvel))
-    seen = jax.vmap(partial(tool.observed, env))(state, state.action)
+    seen = jax.vmap(partial(walks.observed, env))(state, state.action)
     np.testing.assert_allclose(seen["lin_vel"][0], [0.7, -0.1, 0], atol=1e-6)
     np.testing.assert_allclose(
         [seen["pitch"][0], seen["roll"][0], seen["yaw_rate"][0]], [tilt, 0, 2 * np.cos(tilt)], atol=1e-5
@@ -282,7 +283,7 @@ def test_changes_reach_the_robot(jitted):
     kicks[100] = [[0.6, 0.8]]
     changes = {"delay": {"delay": 0.04}, "load": {"load": 3.0}, "kick": {"kicks": kicks}}
     changes |= {"ice": {"kicks": kicks, "friction": 0.01}}
-    seen = tool.run(env, Still(), {}, dict.fromkeys(["plain", *changes], np.zeros((steps, 1, 3))), changes)
+    seen = walks.run(env, Still(), {}, dict.fromkeys(["plain", *changes], np.zeros((steps, 1, 3))), changes)
     moved = {name: np.abs(r.joint_pos[:, 0] - env.default_pose).max(-1) for name, r in seen.items()}
     assert moved["delay"][1] < 0.5 * moved["plain"][1] and moved["delay"][3] > 0.8 * moved["plain"][1]
     speed = {name: np.linalg.norm(r.lin_vel[:, 0, :2], axis=-1) for name, r in seen.items()}
@@ -301,24 +302,24 @@ def test_a_delay_that_an_environment_cannot_keep_is_not_measured(monkeypatch):
         asked.append([*changes])
         return {name: walk() for name in commands}
 
-    monkeypatch.setattr(tool, "run", run)
-    args = tool.Args(str(TASKS / "go1_loco/policy.msgpack"), starts=1, set=("action_delay=0.06,0.06",))
+    monkeypatch.setattr(walks, "run", run)
+    env, *_ = play.load_nominal(TASKS / "go1_loco/policy.msgpack", "c", ("action_delay=0.06,0.06",))
     monkeypatch.setattr(gait, "measure", lambda *_: dict.fromkeys(("falls", "episodes", "turning"), 1.0))
     monkeypatch.setattr(gait, "summary", lambda by_command, robustness: robustness)
-    _, found = tool.evaluate(args)
+    _, found = walks.evaluate(env, Still(), {}, starts=1)
     late, *others = found
     assert late == "delay of 40 ms" and found[late] is None and late not in asked[0] and {*others} == {*asked[0]}
 
 
 def test_the_task_is_nominal():
     """Faults: pushes or delays of a robust training in the measurement, a time limit, --set without use."""
-    args = tool.Args(
-        str(TASKS / "anymal_loco/policy.msgpack"), set=("episode_seconds=1", "friction=0.2,0.2"), engine="c"
+    env, *_ = play.load_nominal(
+        TASKS / "anymal_loco/policy.msgpack", "c", ("episode_seconds=1", "friction=0.2,0.2"), 9.0
     )
-    config = tool.load(args)[0].config
+    config = env.config
     assert config.push_velocity == 0 and config.added_mass == (0, 0) and config.spawn_velocity == 0
-    assert config.friction == (0.2, 0.2) and config.episode_seconds > args.seconds and config.noise == 1
-    unknown = tool.NOMINAL.keys() - {field.name for field in dataclasses.fields(envs.TASKS["go1_loco"][1])}
+    assert config.friction == (0.2, 0.2) and config.episode_seconds > 9 and config.noise == 1
+    unknown = walks.NOMINAL.keys() - {field.name for field in dataclasses.fields(envs.TASKS["go1_loco"][1])}
     assert not unknown, "a field has another name"
 
 

@@ -20,7 +20,7 @@ from test_resume import Interrupted
 import ppo_explore
 import ppo_finetune
 import pretrain_pidm
-from experiment import records, run
+from experiment import checkpoints, records, run
 
 ROOT = Path(__file__).resolve().parent.parent
 KILLS = int(os.environ.get("KILLS", "1"))
@@ -75,7 +75,7 @@ def test_killed_at_any_moment(script, data, tmp_path, monkeypatch):
         before = saved_rows(out)
         if script in RESULT:
             name, kind = RESULT[script]
-            records.load(out / name, kind)
+            checkpoints.load(out / name, kind)
         words = ["--resume", out]
     monkeypatch.setattr(run, "Progress", Interrupted)
     MAIN[script].main(MAIN[script].Args(resume=str(out)))

@@ -13,7 +13,7 @@ import envs
 import ppo_finetune
 from envs import anatomy, loader, reader
 from envs.terrain import flat_scene
-from experiment import records
+from experiment import checkpoints
 from tools import check_robot, replay
 
 SIDES = {"FL": (0.2, 0.1), "FR": (0.2, -0.1), "RL": (-0.2, 0.1), "RR": (-0.2, -0.1)}
@@ -520,7 +520,7 @@ def test_a_run_is_repeatable_without_its_file(write, tmp_path, refused, capsys, 
     path.unlink()
     record = tmp_path / "run/args.json"
     assert loader.load(record) == json.loads(record.read_text())["config"]["body"]
-    _, meta = records.load(tmp_path / "run/policy.msgpack", "policy")
+    _, meta = checkpoints.load(tmp_path / "run/policy.msgpack", "policy")
     assert meta["body"] == loader.load(record)
     longer = write(quadruped().replace('pos="0 0 -0.2">', 'pos="0 0 -0.21">'), name="long.xml")
     again = ppo_finetune.Args(

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import ppo_finetune
-from experiment import figures, metrics, records
+from experiment import checkpoints, figures, metrics, records
 from experiment.progress import Progress
 from experiment.run import Run
 
@@ -164,8 +164,8 @@ def test_weights_that_are_not_finite_are_never_saved(tmp_path):
         run.log(6, [chunk(made_up(1))])
         with pytest.raises(records.UserError, match="weights are not finite after iteration 6"):
             run.save_policies(good, bad)
-    params, _ = records.load(tmp_path / "policy.msgpack", "policy")
+    params, _ = checkpoints.load(tmp_path / "policy.msgpack", "policy")
     np.testing.assert_array_equal(params["w"], [1.0, 1.0])
-    state, rows = records.load_state(tmp_path, jnp.zeros(2))
+    state, rows = checkpoints.load_state(tmp_path, jnp.zeros(2))
     np.testing.assert_array_equal(state, [1.0, 1.0])
     assert [row["iteration"] for row in rows] == [3.0]

@@ -16,7 +16,7 @@ import envs
 import ppo_finetune as finetune
 import pretrain_pidm as script
 from envs import pedipulation
-from experiment import figures, records
+from experiment import checkpoints, figures, records
 from results import pidm
 
 K, X, A = 5, 30, 12  # Go1
@@ -216,7 +216,7 @@ def test_data_of_another_time_step_make_a_pidm_of_that_time_step(folder, tmp_pat
     data = random_dataset(tmp_path / "slow", config={"decimation": 8, "physics_dt": 0.005})
     script.main(script.Args(data=str(data), preset="smoke", run_dir=str(tmp_path / "run")))
     pidm = str(tmp_path / "run/pidm.msgpack")
-    assert records.load(tmp_path / "run/pidm.msgpack", "PIDM checkpoint")[1]["dt"] == 0.04
+    assert checkpoints.load(tmp_path / "run/pidm.msgpack", "PIDM checkpoint")[1]["dt"] == 0.04
     script.main(script.Args(data=str(data), eval=pidm))
     refused(script.main, script.Args(data=str(folder), eval=pidm), "dt 0.04, here is dt 0.02")
 
@@ -337,7 +337,7 @@ def test_patience_ends_a_training_which_resumes_to_the_same_weights(folder, tmp_
     monkeypatch.setattr(script, "validate", lambda predictor, env, variables, *_: judged.append(variables))
     args = script.Args(data=str(folder), preset="smoke", epochs=20, patience=2, run_dir=str(tmp_path / "whole"))
     script.main(args)
-    whole = records.load(tmp_path / "whole/pidm.msgpack", "PIDM checkpoint")
+    whole = checkpoints.load(tmp_path / "whole/pidm.msgpack", "PIDM checkpoint")
     sizes, per_epoch = [*step_sizes], len(step_sizes) // 7
     assert len(sizes) == 7 * per_epoch and whole[1]["metrics"]["iteration"] == 6, "the best epoch is kept"
     jax.tree.map(np.testing.assert_array_equal, judged[0], whole[0])
@@ -353,7 +353,7 @@ def test_patience_ends_a_training_which_resumes_to_the_same_weights(folder, tmp_
         except RuntimeError:
             assert killed
     assert step_sizes == sizes
-    part = records.load(tmp_path / "part/pidm.msgpack", "PIDM checkpoint")
+    part = checkpoints.load(tmp_path / "part/pidm.msgpack", "PIDM checkpoint")
     jax.tree.map(np.testing.assert_array_equal, part[0], whole[0])
     script.main(script.Args(resume=str(tmp_path / "part")))
     assert step_sizes == sizes, "a complete run is not trained further"
@@ -394,7 +394,7 @@ def start(env, task="go1_loco", **changes):
 def test_warm_start_loads_the_named_parts_and_no_others(pretrained, load_into, branches, parts, jitted, capsys):
     path = pretrained / "pidm.msgpack"
     _, fresh, warm = start(jitted("go1_loco").env, pretrained=str(path), load_into=load_into)
-    pidm, _ = records.load(path, "PIDM checkpoint")
+    pidm, _ = checkpoints.load(path, "PIDM checkpoint")
     for branch in ("actor", "critic"):
         for name, part in warm["params"][branch].items():
             loaded = name in parts and branch in branches
@@ -409,7 +409,7 @@ def test_warm_start_loads_the_named_parts_and_no_others(pretrained, load_into, b
 
 def test_without_a_checkpoint_only_the_input_scaling_is_loaded(jitted, capsys):
     _, fresh, warm = start(jitted("go1_loco").env)
-    shipped, _ = records.load(finetune.SHIPPED / "go1.msgpack", "PIDM checkpoint")
+    shipped, _ = checkpoints.load(finetune.SHIPPED / "go1.msgpack", "PIDM checkpoint")
     jax.tree.map(np.testing.assert_array_equal, warm["params"], fresh["params"])
     for name in ("prop_mean", "prop_std", "action_mean", "action_std"):
         np.testing.assert_array_equal(warm["normalizer"][name], shipped["normalizer"][name])
@@ -422,7 +422,7 @@ def test_a_robot_without_a_shipped_checkpoint(pretrained, jitted, tmp_path, monk
     net, _, saved = start(env, pretrained=str(pretrained / "pidm.msgpack"))
     calm = saved["params"] | {"log_std": saved["params"]["log_std"] - 1}  # as after a training
     saved = saved | {"params": calm}
-    records.save(policy, saved, {"task": "go1_loco", "args": {}})
+    checkpoints.save(policy, saved, {"task": "go1_loco", "args": {}})
     monkeypatch.setattr(finetune, "SHIPPED", tmp_path)
     args = finetune.Args(preset="smoke", network="pidm", policy=str(policy))
     state = finetune.init_state(finetune.merge(args, env.config.ppo), env, net, finetune.optax.scale_by_adam())
@@ -432,9 +432,9 @@ def test_a_robot_without_a_shipped_checkpoint(pretrained, jitted, tmp_path, monk
     assert np.isclose(state.lr, 1e-4), "1e-3 overshoots in the first update"
     assert finetune.merge(args, env.config.ppo).run_dir == "runs/go1_loco/pidm/seed0", "not called random"
     monkeypatch.setitem(envs.TASKS, "stand", (pedipulation.Pedipulation, envs.TASKS["go1_loco"][1]))
-    records.save(policy, saved, {"task": "stand", "args": {}})
+    checkpoints.save(policy, saved, {"task": "stand", "args": {}})
     with pytest.raises(records.UserError, match=r"sees lin_vel, .*, target; this task has lin_vel, .*, command, "):
-        records.load_networks(policy, saved, env)  # as many numbers in another order
+        checkpoints.load_networks(policy, saved, env)  # as many numbers in another order
     with pytest.raises(records.UserError, match="--load-into none"):
         start(env)
     other = finetune.Args(pretrained=str(pretrained / "pidm.msgpack"), load_into="none")
@@ -453,7 +453,7 @@ def test_a_resumed_run_does_not_need_the_weights_it_began_with(gone, jitted):
 def test_shuffled_weights_keep_their_values_and_lose_their_place(pretrained, jitted):
     path = pretrained / "pidm.msgpack"
     *_, warm = start(jitted("go1_loco").env, pretrained=str(path), load_into="shuffled")
-    pidm, _ = records.load(path, "PIDM checkpoint")
+    pidm, _ = checkpoints.load(path, "PIDM checkpoint")
     for branch in ("actor", "critic"):
         for part in ("history_encoder", "backbone"):
             got, want = (p[part]["Dense_1"]["kernel"] for p in (warm["params"][branch], pidm["params"]))
@@ -469,7 +469,7 @@ def test_a_training_starts_from_the_loaded_history_encoder(pretrained, tmp_path)
     path, out = pretrained / "pidm.msgpack", tmp_path / "run"
     args = finetune.Args(preset="smoke", pretrained=str(path), load_into="history_encoder", run_dir=str(out))
     state = finetune.main(dataclasses.replace(args, lr=1e-12, desired_kl=1e-30))
-    params, (pidm, _) = state.params["params"], records.load(path, "PIDM checkpoint")
+    params, (pidm, _) = state.params["params"], checkpoints.load(path, "PIDM checkpoint")
     np.testing.assert_array_equal(state.params["normalizer"]["prop_std"][0], pidm["normalizer"]["prop_std"])
     for branch in ("actor", "critic"):
         moved = {
@@ -620,10 +620,10 @@ def test_eval_repeats_the_validation(pretrained, tmp_path):
 
 
 def test_eval_of_another_robots_pidm_is_refused(pretrained, folder, tmp_path, refused):
-    params, meta = records.load(pretrained / "pidm.msgpack", "PIDM checkpoint")
+    params, meta = checkpoints.load(pretrained / "pidm.msgpack", "PIDM checkpoint")
     for name, value in (("robot", "g1"), ("history", 3)):
         other = tmp_path / f"{name}.msgpack"
-        records.save(other, params, meta | {name: value})
+        checkpoints.save(other, params, meta | {name: value})
         refused(
             script.main,
             script.Args(data=str(folder), eval=str(other)),
@@ -631,7 +631,7 @@ def test_eval_of_another_robots_pidm_is_refused(pretrained, folder, tmp_path, re
             f"here is {name} {meta[name]}",
         )
     cut = tmp_path / "cut.msgpack"
-    records.save(cut, jax.tree.map(lambda x: x[..., :-1], params), meta)
+    checkpoints.save(cut, jax.tree.map(lambda x: x[..., :-1], params), meta)
     refused(script.main, script.Args(data=str(folder), eval=str(cut)), "this task needs")
     refused(script.main, script.Args(data=str(folder), eval=str(tmp_path / "none")), "--eval", "no such file")
     assert not (tmp_path / "validation.json").exists()
@@ -684,7 +684,7 @@ def test_too_many_samples_are_refused(tmp_path, refused):
 
 def test_bad_checkpoints_are_refused(pretrained, tmp_path, jitted, refused):
     path = pretrained / "pidm.msgpack"
-    params, meta = records.load(path, "PIDM checkpoint")
+    params, meta = checkpoints.load(path, "PIDM checkpoint")
     env = jitted("go1_loco").env
 
     def check(checkpoint, *words):
@@ -693,7 +693,7 @@ def test_bad_checkpoints_are_refused(pretrained, tmp_path, jitted, refused):
         assert all(word in str(error.value) for word in words) and "\n" not in str(error.value), error.value
 
     def changed(name, params, meta):
-        records.save(tmp_path / name, params, meta)
+        checkpoints.save(tmp_path / name, params, meta)
         return tmp_path / name
 
     check(tmp_path / "none", "cannot read PIDM checkpoint")

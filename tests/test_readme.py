@@ -21,9 +21,8 @@ import play
 import ppo_explore
 import ppo_finetune
 from envs import render
-from experiment import records
+from experiment import checkpoints, walks
 from experiment.run import Run
-from tools import gait
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = {path.relative_to(ROOT).as_posix(): path.read_text() for path in (ROOT / "README.md", *ROOT.glob("docs/*.md"))}
@@ -97,7 +96,7 @@ def zeros_alone(init_state):
 
     def zeros(x):
         bits = jnp.zeros((*x.shape, 2), jnp.uint32)
-        return jax.random.wrap_key_data(bits) if records.is_key(x) else jnp.zeros(x.shape, x.dtype)
+        return jax.random.wrap_key_data(bits) if checkpoints.is_key(x) else jnp.zeros(x.shape, x.dtype)
 
     def made(args, *rest, **parts):
         if args.run_dir in READ:
@@ -113,7 +112,7 @@ def quick(monkeypatch):
 
     Each kind of program is traced once. Evaluations, which have tests of their own, find robots that do not move.
     """
-    compile, size, measure = Run.compile, (render.WIDTH, render.HEIGHT), gait.evaluate
+    compile, size, measure = Run.compile, (render.WIDTH, render.HEIGHT), walks.evaluate
 
     def compile_if_read(self, function, *inputs):
         if self.args.run_dir in READ:
@@ -129,16 +128,15 @@ def quick(monkeypatch):
         start = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), like)
         return {}, start, jnp.zeros((env.episode_steps, env.engine.model.nq))
 
-    def measure_once(args):
-        gait.load(args)
-        MEASURED[:] = MEASURED or [measure(args)]
+    def measure_once(*args, **few):
+        MEASURED[:] = MEASURED or [measure(*args, **few)]
         return MEASURED[0]
 
     for script in (ppo_finetune, ppo_explore):
         monkeypatch.setattr(script, "init_state", zeros_alone(script.init_state))
     monkeypatch.setattr(Run, "compile", compile_if_read)
     monkeypatch.setattr(play, "evaluate", evaluate)
-    monkeypatch.setattr(gait, "evaluate", measure_once)
+    monkeypatch.setattr(walks, "evaluate", measure_once)
     monkeypatch.setattr(render, "draw", lambda spec, qpos, size=size: [Image.new("RGB", size) for _ in qpos])
 
 

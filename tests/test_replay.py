@@ -10,7 +10,7 @@ import pytest
 
 import envs
 import ppo_finetune
-from experiment import records
+from experiment import checkpoints, records
 from tools import replay
 
 
@@ -29,7 +29,7 @@ def test_a_robot_that_fails_is_found_and_dumped(run, capsys):
     assert "nothing failed from iteration 4 to 4" in capsys.readouterr().out and not (out / "nan.npz").exists()
     qvel = state.env.physics.qvel.at[2, 2].set(2000.0)
     broken = state.replace(env=state.env.replace(physics=state.env.physics.replace(qvel=qvel)))
-    records.save_state(out, broken, [])
+    checkpoints.save_state(out, broken, [])
     replay.main(replay.Args(str(out)))
     assert f"iteration {int(state.iteration)}, step 0: 1 of 4 environments failed" in capsys.readouterr().out
     with np.load(out / "nan.npz") as dump:

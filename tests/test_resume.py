@@ -21,7 +21,7 @@ import pytest
 import ppo_explore
 import ppo_finetune
 import pretrain_pidm
-from experiment import records, run
+from experiment import arguments, records, run
 
 RESULT = {ppo_explore: "action.npy", pretrain_pidm: "pidm.msgpack", ppo_finetune: "policy.msgpack"}
 
@@ -140,7 +140,7 @@ def test_stage_two_of_a_robot_from_a_file_goes_on(tmp_path):
     args = dataclasses.asdict(pretrain_pidm.Args(run_dir=str(tmp_path)))
     record = args | {"config": {"body": {"digest": "d"}}, "versions": {}}
     (tmp_path / "args.json").write_text(json.dumps(record))
-    resumed = records.resumed(pretrain_pidm.Args(resume=str(tmp_path)))
+    resumed = arguments.resumed(pretrain_pidm.Args(resume=str(tmp_path)))
     assert resumed.run_dir == str(tmp_path) and resumed.epochs == args["epochs"]
 
 

@@ -21,7 +21,7 @@ import play
 import ppo_explore
 import ppo_finetune as script
 from envs import render
-from experiment import gait, records
+from experiment import checkpoints, gait, records
 from experiment.progress import Progress
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -45,7 +45,7 @@ def test_run_folder(trained):
     assert [float(row["env_steps"]) for row in rows] == [32, 64]
     assert {f"reward/{term}" for term in envs.TASKS["g1_loco"][1].weights} <= set(rows[0])
     assert (out / "curve.png").stat().st_size > 5000
-    params, meta = records.load(out / "policy.msgpack", "policy")
+    params, meta = checkpoints.load(out / "policy.msgpack", "policy")
     assert meta["task"] == "g1_loco"
     jax.tree.map(lambda a, b: np.testing.assert_array_equal(a, b[0]), params, jax.device_get(state.params))
     assert not list(out.glob("*.tmp"))
@@ -57,7 +57,7 @@ def test_same_seed_same_weights(trained, tmp_path):
     alone = script.main(dataclasses.replace(SMOKE, task="g1_loco", seed=1, run_dir=str(tmp_path / "b")))
     for i, one in enumerate((trained[1], alone)):
         jax.tree.map(lambda a, b, i=i: np.testing.assert_array_equal(a[i], b[0]), both.params, one.params)
-        params, meta = records.load(tmp_path / f"both/seed{i}/policy.msgpack", "policy")
+        params, meta = checkpoints.load(tmp_path / f"both/seed{i}/policy.msgpack", "policy")
         jax.tree.map(lambda a, b, i=i: np.testing.assert_array_equal(a, b[0]), params, jax.device_get(one.params))
         assert meta["args"]["seed"] == i
     rows = [(path / "metrics.csv").read_text() for path in (trained[0], tmp_path / "both/seed0")]
@@ -242,10 +242,10 @@ def test_wrong_policies_are_refused(trained, tmp_path, refused):
     cut = tmp_path / "cut.msgpack"
     cut.write_bytes(policy.read_bytes()[:-100])
     check(cut, "damaged")
-    params, meta = records.load(policy, "policy")
-    records.save(tmp_path / "task.msgpack", params, meta | {"task": "spot_loco"})
+    params, meta = checkpoints.load(policy, "policy")
+    checkpoints.save(tmp_path / "task.msgpack", params, meta | {"task": "spot_loco"})
     check(tmp_path / "task.msgpack", "is a policy for 'spot_loco'", "g1_loco")
-    records.save(tmp_path / "other.msgpack", params, meta | {"task": "go1_loco"})
+    checkpoints.save(tmp_path / "other.msgpack", params, meta | {"task": "go1_loco"})
     check(tmp_path / "other.msgpack", "this task needs")
     check(policy, "g1_loco has no level 3", level=3)
     check(policy, "--episodes must be", "not 0", episodes=0)
@@ -398,5 +398,5 @@ def test_interrupt_keeps_the_files(tmp_path, monkeypatch, capsys):
     assert "interrupted" in capsys.readouterr().out and signal.getsignal(signal.SIGINT) == before
     rows = list(csv.DictReader((tmp_path / "metrics.csv").open()))
     assert len(rows) == 1 and None not in rows[0].values()
-    records.load(tmp_path / "policy.msgpack", "policy")
+    checkpoints.load(tmp_path / "policy.msgpack", "policy")
     assert (tmp_path / "curve.png").exists()

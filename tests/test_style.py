@@ -1,6 +1,7 @@
 """Checks beyond ruff's: size, dead arguments, long or nested functions, imports that go upwards, deviations, faults."""
 
 import ast
+import graphlib
 import re
 from pathlib import Path
 
@@ -24,7 +25,10 @@ MODULES = {  # package -> its modules; each may import what stands before it
         "courses",
         *("locomotion", "explore", "newcomers", "pedipulation", "parkour", "render"),
     ),
-    "experiment": ("records", "devices", "metrics", "figures", "dataset", "progress", "run", "gait"),
+    "experiment": (
+        *("records", "arguments", "checkpoints", "devices", "metrics", "figures", "dataset", "progress", "run"),
+        *("gait", "walks"),
+    ),
 }
 BELOW = {  # what a part of the project may import, besides itself
     "envs": set(),
@@ -114,6 +118,17 @@ def test_modules_import_downwards(package):
     for layer, name in enumerate(MODULES[package]):
         used = {".".join(module.split(".")[:2]) for module in imports(f"{package}/{name}.py")}
         assert not used & {f"{package}.{other}" for other in MODULES[package][layer:]}, name
+
+
+def test_no_imports_go_in_a_circle():
+    """play.py and the tools may import each other, no two files may."""
+    names = {".".join(file.with_suffix("").parts): file for file in FILES}
+    graph = {
+        name: {end for module in imports(file) for end in (module, module.rpartition(".")[0])} & names.keys()
+        for name, file in names.items()
+    }
+    assert graph["play"] >= {"experiment.walks", "tools.viewer"}
+    list(graphlib.TopologicalSorter(graph).static_order())  # CycleError
 
 
 def test_every_deviation_is_listed():

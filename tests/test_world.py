@@ -25,7 +25,7 @@ import play
 import ppo_finetune as script
 import pretrain_pidm
 from envs import engine, gl, render
-from experiment import dataset, devices, figures, records, run
+from experiment import checkpoints, dataset, devices, figures, records, run
 from results import tables
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -108,7 +108,7 @@ def test_strange_surroundings_change_nothing(usual, strange):
     process, folder = strange
     assert (process.returncode, process.stderr) == (0, b"")
     assert rows_of(folder) == rows_of(usual)
-    weights = [records.load(out / "policy.msgpack", "policy")[0] for out in (usual, folder)]
+    weights = [checkpoints.load(out / "policy.msgpack", "policy")[0] for out in (usual, folder)]
     jax.tree.map(np.testing.assert_array_equal, *weights)
     assert {path.name for path in folder.iterdir()} == {path.name for path in usual.iterdir()}
 

@@ -322,7 +322,7 @@ FAULTS = {  # (file, tests, words for -k) -> faults: name, old text, new text
     ("experiment/records.py", "test_world", "disk_that_fills"): [
         ("files written in place", 'path.with_name(path.name + ".tmp")', "path"),
     ],
-    ("experiment/records.py", "test_resume", "another_version and finetune"): [
+    ("experiment/arguments.py", "test_resume", "another_version and finetune"): [
         ("arguments that are missing are filled in", "sorted(names ^ {", "sorted(names - {"),
     ],
     ("experiment/metrics.py", "test_metrics", "a_row_is"): [
@@ -337,7 +337,7 @@ FAULTS = {  # (file, tests, words for -k) -> faults: name, old text, new text
         ("states saved every few seconds", "60 * self.args.save_minutes", "self.args.save_minutes"),
     ],
     ("experiment/run.py", "test_metrics", "not_finite"): [
-        ("weights that are not finite are saved", "if not records.finite(params):", "if False:"),
+        ("weights that are not finite are saved", "if not checkpoints.finite(params):", "if False:"),
     ],
 }
 

@@ -28,7 +28,7 @@ sys.path.insert(0, str(ROOT))
 import envs
 import ppo_finetune
 from envs.engine import mujoco  # envs comes first: it takes MUJOCO_GL out of the way
-from experiment import records
+from experiment import arguments, checkpoints, records
 from experiment.run import make_env
 
 
@@ -60,12 +60,12 @@ def trace(args, env, net, state):
 
 def find(folder, iterations, robots):
     """Write nan.npz and print what failed. UserError if the folder is no run that can be resumed."""
-    args = records.resumed(ppo_finetune.Args(resume=str(folder)))
+    args = arguments.resumed(ppo_finetune.Args(resume=str(folder)))
     env = make_env(partial(envs.make, robust=args.robust, robot=args.robot), args.task, args)
     args = ppo_finetune.merge(args, env.config.ppo)
     net, opt = ppo_finetune.make_net(args, env), optax.scale_by_adam()
     like = jax.eval_shape(partial(ppo_finetune.init_state, args, env, net, opt))
-    state, _ = records.load_state(folder, like)
+    state, _ = checkpoints.load_state(folder, like)
     state = jax.tree.map(jnp.asarray, state)
     jitted_trace = jax.jit(partial(trace, args, env, net))
     advance = jax.jit(lambda state: ppo_finetune.iteration(args, env, net, opt, state)[0])
@@ -85,7 +85,7 @@ def find(folder, iterations, robots):
             count = f"{failed[last].sum()} of {args.num_envs}"
             return print(f"iteration {now}, step {last}: {count} environments failed; wrote {path}")
         state = advance(state)
-        if not records.finite(state.params):
+        if not checkpoints.finite(state.params):
             return print(f"iteration {now}: no robot failed, but the update made weights that are not finite")
     return print(f"nothing failed from iteration {first} to {state.iteration - 1}; see --iterations")
 
