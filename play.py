@@ -1,12 +1,12 @@
 """Run a trained policy: evaluate it, film it, watch and steer it, or export it for a robot.
 
-    python play.py results/tasks/go1_loco/policy.msgpack
+    python play.py results/tasks/go1_loco/policy.msgpack --out runs/look
     python play.py results/tasks/go1_loco/policy.msgpack --video go1.gif
     python play.py results/tasks/anymal_climb_up/policy.msgpack --web --level 3
     python play.py results/tasks/go1_loco/policy.msgpack --export go1.onnx
 
-By default it evaluates the mean action, and writes eval.json, rollout.png and rollout.gif beside the policy. The task
-stands in the policy file.
+By default it evaluates the mean action, and writes eval.json, rollout.png and rollout.gif beside the policy, or to
+--out. The task stands in the policy file.
 """
 
 import json
@@ -35,6 +35,7 @@ class Args:
     level: int | None = None  # level of an obstacle course, 0 to 9; None: evaluate all, show level 4
     set: tuple[str, ...] = ()  # NAME=VALUE of the task's config, e.g. friction=0.3,0.3 noise=0
     engine: str = "auto"  # physics: c (CPU threads), mjx (accelerators), warp (NVIDIA)
+    out: str | None = None  # folder of the evaluation's files; None: that of the policy
     video: str | None = None  # film a whole episode as this .gif or .mp4
     viewer: bool = False  # watch and steer the robot in a window
     web: bool = False  # watch and steer it in a browser
@@ -128,6 +129,8 @@ def run_evaluation(args):
     if not 1 <= args.episodes <= 100_000:
         raise records.UserError(f"--episodes must be from 1 to 100000, not {args.episodes}")
     env, net, params, meta = load(args)
+    folder = Path(args.out or Path(args.policy).parent)
+    folder.mkdir(parents=True, exist_ok=True)  # what cannot be written shows before the work
     levels = range(env.LEVELS) if args.level is None else [args.level]
     run = jax.jit(lambda params, level: evaluate(env, net, params, args.episodes, level)[0])
     report = {}
@@ -144,7 +147,6 @@ def run_evaluation(args):
         walker = load_nominal(args.policy, args.engine, args.set)[:3]
         by_command, report["gait"] = walks.evaluate(*walker, starts=min(max(args.episodes // 3, 1), 20))
         print(gait.lines(by_command, report["gait"]))
-    folder = Path(args.policy).parent
     records.replace_text(folder / "eval.json", json.dumps(report, indent=1) + "\n")
     shown_with = {"title": title(show, meta), "markers": show.markers(start.task)}
     for name, picture in render.film(show, qpos, start.physics, **shown_with, **show.FILM_WINDOW).items():

@@ -167,6 +167,9 @@ def test_commands_run(command, workplace, quick, monkeypatch, capsys):
     with contextlib.suppress(ReadyError):
         module.main(args)
     assert capsys.readouterr().out, "it says what it did"
+    if "--out" in words:
+        recorded = "results/tasks/go1_loco/eval.json"
+        assert (Path(args.out) / "eval.json").exists() and Path(recorded).read_text() == (ROOT / recorded).read_text()
 
 
 def test_python_blocks_run():
