@@ -1,6 +1,7 @@
 """The benchmark measures, reports reasons for failures, and refuses bad arguments."""
 
 import json
+import time
 from types import SimpleNamespace
 
 import pytest
@@ -17,6 +18,17 @@ def test_a_figure_from_a_process_of_its_own():
 def test_a_failure_gives_its_reason():
     assert "unknown task" in bench.in_process(120, "stepping", "go2_loco", "c", 4, False)["failed"]
     assert bench.in_process(0.01, "stepping", "go1_loco", "c", 4, False)["failed"].startswith("did not end in")
+
+
+def test_what_takes_too_long_ends_with_all_that_it_started(tmp_path, monkeypatch):
+    """Fault: a training goes on while the next figures are measured."""
+    program, sign = tmp_path / "python", tmp_path / "alive"
+    program.write_text(f"#!/bin/sh\n(sleep 1; touch {sign}) &\nwait\n")
+    program.chmod(0o755)
+    monkeypatch.setattr(bench.sys, "executable", str(program))
+    assert "did not end" in bench.in_process(0.1, "training", "go1_loco")["failed"]
+    time.sleep(1.2)
+    assert not sign.exists()
 
 
 def test_page_has_every_row(tmp_path):

@@ -21,6 +21,7 @@ import json
 import os
 import platform
 import resource
+import signal
 import subprocess
 import sys
 import tempfile
@@ -124,13 +125,18 @@ def in_process(limit_s, name, *inputs):
     jaxlib 0.10.2 can lock up on a CPU of two cores where two batched Cholesky factorisations meet (seen with G1, mjx).
     """
     command = [sys.executable, __file__, "--cell", json.dumps([name, *inputs])]
-    try:
-        run = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=limit_s, check=False)
-    except subprocess.TimeoutExpired:
-        return {"failed": f"did not end in {limit_s:.0f} s"}
-    if run.returncode:
-        return {"failed": (run.stderr.strip().splitlines() or [f"exit code {run.returncode}"])[-1][:120]}
-    return json.loads(run.stdout.splitlines()[-1])
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    with subprocess.Popen(command, cwd=ROOT, start_new_session=True, **pipes) as process:
+        try:
+            out, error = process.communicate(timeout=limit_s)
+        except subprocess.TimeoutExpired:
+            return {"failed": f"did not end in {limit_s:.0f} s"}
+        finally:
+            if process.poll() is None:
+                os.killpg(process.pid, signal.SIGKILL)  # also a training that it has started
+    if process.returncode:
+        return {"failed": (error.strip().splitlines() or [f"exit code {process.returncode}"])[-1][:120]}
+    return json.loads(out.splitlines()[-1])
 
 
 def engine_rows(args):
