@@ -310,7 +310,6 @@ outputs of the actor's backbone in the first rollout of a task. Their effective 
 number of directions, of 64, that they fill. The study's pretrained arm is "loaded, the rest as PyTorch's".
 
 """
-AGAIN = ("anymal_d", "g1", "go1")  # robots whose weights are older than the data they were measured on, until made anew
 FIRST = """Of {robots}: errors were measured (`--stages collect validate`) on a collection that these commands made
 later, on another machine or with other random numbers. So the weights have seen nothing of it. The last row of
 metrics.csv is on the collection of the training.
@@ -333,10 +332,11 @@ def write_readme():
         for extra in (folder / "coverage.json", folder / "features.json"):
             result |= json.loads(extra.read_text()) if extra.exists() else {}
         trained = json.loads((folder / "args.json").read_text())
-        epochs = len((folder / "metrics.csv").read_text().splitlines()) - 1
-        lines += [f"## {folder.name}", "", f"{meta['transitions']:,} transitions, {epochs} epochs.", ""]
+        rows = records.read_rows(folder / "metrics.csv")
+        lines += [f"## {folder.name}", "", f"{meta['transitions']:,} transitions, {len(rows)} epochs.", ""]
         lines += [*commands(folder.name, meta["args"], trained), ""]
-        first += [folder.name] if folder.name in AGAIN else []
+        if all(abs(row["error"] - result["error"]) > 1e-4 * result["error"] for row in rows):  # not of the training
+            first.append(folder.name)
         lines += [
             "| what | figure |",
             "|---|---|",
