@@ -22,8 +22,8 @@ import tyro
 import envs
 import ppo_finetune
 from envs.locomotion import Locomotion
-from experiment import checkpoints, gait, metrics, records, walks
-from experiment.run import make_env, typed
+from experiment import arguments, checkpoints, gait, metrics, records, walks
+from experiment.run import make_env
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ def load_policy(path, engine="auto", overrides=(), **fields):
     trained = {name: meta["args"].get(name) for name in ("network", "init_std", "hidden", "intention")}
     args = ppo_finetune.Args(task=meta["task"], engine=engine, set=tuple(overrides), **trained)
     make = partial(envs.make, robust=meta["args"].get("robust", False), robot=meta.get("body"))
-    env = make_env(make, args.task, args, **typed(meta["args"].get("set", ())) | fields)
+    env = make_env(make, args.task, args, **arguments.set_fields(meta["args"].get("set", ())) | fields)
     net = ppo_finetune.make_net(args, env)
     state = jax.eval_shape(env.reset, jax.random.key(0))
     like = jax.eval_shape(net.init, jax.random.key(0), net.inputs(state.obs, state.history))

@@ -23,7 +23,7 @@ import tyro
 
 import envs
 from experiment import arguments, checkpoints, dataset, devices, figures, metrics, records
-from experiment.run import Run, make_env, planned_iterations
+from experiment.run import Run, make_env
 
 jax.config.update("jax_default_matmul_precision", "highest")  # TF32 of recent GPUs changes what is learned
 
@@ -177,7 +177,7 @@ class ActorCritic(nn.Module):
     weight_init: str = "orthogonal"
 
     def setup(self):
-        self.actor = MLP((*self.hidden, self.action_dim), 0.01, self.weight_init)  # the first actions are ~0
+        self.actor = MLP((*self.hidden, self.action_dim), 0.01, self.weight_init)  # the first mean actions are ~0
         self.critic = MLP((*self.hidden, 1), 0.05, self.weight_init)
         # Deviation (log std): rsl_rl learns the std itself.
         self.log_std = self.param("log_std", nn.initializers.constant(jnp.log(self.init_std)), (self.action_dim,))
@@ -257,7 +257,7 @@ def init_ensemble(args, member, opt, norm, batch, key):
     return Ensemble(params, opt.init(params), norm, jnp.zeros(()))
 
 
-def bootstrap_indices(key, shape, filled):
+def draw_indices(key, shape, filled):
     """Draw indices into the ring buffer with replacement, independently for every entry of `shape` (steps, M, B)."""
     return jax.random.randint(key, shape, 0, filled)
 
@@ -265,7 +265,7 @@ def bootstrap_indices(key, shape, filled):
 def retrain(args, member, opt, ensemble, buffer, filled, key):
     """Fit every member to bootstrap samples of the buffer, whose first `filled` rows hold data. Also the mean loss."""
     k_norm, k_fit = jax.random.split(key)
-    norm = statistics(jax.tree.map(lambda x: x[bootstrap_indices(k_norm, (4096,), filled)], buffer))
+    norm = statistics(jax.tree.map(lambda x: x[draw_indices(k_norm, (4096,), filled)], buffer))
 
     def fit(carry, index):
         params, opt_state = carry
@@ -274,7 +274,7 @@ def retrain(args, member, opt, ensemble, buffer, filled, key):
         updates, opt_state = opt.update(grads, opt_state)
         return (optax.apply_updates(params, updates), opt_state), loss / args.members
 
-    indices = bootstrap_indices(k_fit, (args.ensemble_steps, args.members, args.ensemble_batch), filled)
+    indices = draw_indices(k_fit, (args.ensemble_steps, args.members, args.ensemble_batch), filled)
     (params, opt_state), loss = jax.lax.scan(fit, (ensemble.params, ensemble.opt_state), indices)
     return ensemble.replace(params=params, opt_state=opt_state, norm=norm), loss.mean()
 
@@ -302,7 +302,7 @@ class TrainState:
     params: dict
     opt_state: optax.OptState
     lr: jax.Array  # ()
-    env: envs.base.State  # (N, ...)
+    env_state: envs.base.State  # (N, ...)
     first: jax.Array  # (N,) bool: the next transition opens an episode
     ensemble: Ensemble
     buffer: Transitions  # (R, ...) ring
@@ -402,16 +402,13 @@ def ppo_loss(args, env, net, params, log_std_old, batch, key):
     """Total loss of one minibatch (leading axis B), and its parts for the log."""
     roll, advantage, ret = batch
     mean, log_std, value = net.apply(params, roll.inputs)
-
-    # clipped surrogate
+    # clipped surrogate, Schulman et al. 2017 eq. 7
     ratio = jnp.exp(log_prob(mean, log_std, roll.action) - roll.log_prob)
     clipped = jnp.clip(ratio, 1 - args.clip, 1 + args.clip)
     policy_loss = -jnp.minimum(ratio * advantage, clipped * advantage).mean()
-
     # clipped value loss
     value_clipped = roll.value + jnp.clip(value - roll.value, -args.clip, args.clip)
     value_loss = jnp.maximum((value - ret) ** 2, (value_clipped - ret) ** 2).mean()
-
     entropy = jnp.sum(log_std + 0.5 * jnp.log(2 * jnp.pi * jnp.e))
     loss = policy_loss + args.value_coef * value_loss - args.entropy_coef * entropy
     parts = {"policy_loss": policy_loss, "value_loss": value_loss, "entropy": entropy}
@@ -469,9 +466,9 @@ def update(args, env, net, opt, state, batch, key):
     advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
     log_std_old = state.params["params"]["log_std"]
 
-    def minibatch(carry, inputs):
+    def minibatch(carry, xs):
         params, opt_state, lr = carry
-        batch, key = inputs
+        batch, key = xs
         gradient = jax.grad(partial(ppo_loss, args, env, net, log_std_old=log_std_old, key=key), has_aux=True)
         grads, losses = devices.mean_in_pieces(lambda piece: gradient(params, batch=piece), batch)
         lr = adapt_lr(args, lr, losses["kl"])
@@ -496,7 +493,7 @@ def update(args, env, net, opt, state, batch, key):
 def iteration(args, env, net, opt, member, member_opt, state):
     """One iteration: rollout, novelty as reward, PPO update, ensemble update. Returns the state, metrics and data."""
     k_roll, k_update, k_retrain = jax.random.split(jax.random.fold_in(jax.random.key(args.seed), state.iteration), 3)
-    env_state, roll, transitions, data, report = rollout(args, env, net, state.params, state.env, k_roll)
+    env_state, roll, transitions, data, report = rollout(args, env, net, state.params, state.env_state, k_roll)
     novelty, ensemble, novelty_report = measure_novelty(member, state.ensemble, transitions)
 
     if args.policy == "explore":
@@ -518,8 +515,8 @@ def iteration(args, env, net, opt, member, member_opt, state):
     first = jnp.concatenate([state.first[None], roll.done])  # (T+1, N): the step after a done opens an episode
     data |= {"x": transitions.prop[:, :, -1], "action": transitions.action, "first": first[:-1]}
     report = metrics.over_time(report) | losses | novelty_report
-    report |= {"ensemble_nll": loss, "action_std": jnp.exp(state.params["params"]["log_std"]).mean()}
-    state = state.replace(env=env_state, first=first[-1], ensemble=ensemble, buffer=buffer)
+    report |= {"lr": state.lr, "ensemble_nll": loss, "action_std": jnp.exp(state.params["params"]["log_std"]).mean()}
+    state = state.replace(env_state=env_state, first=first[-1], ensemble=ensemble, buffer=buffer)
     return state.replace(iteration=state.iteration + 1), (report, data)
 
 
@@ -550,7 +547,7 @@ def explore(args):
     member = PIDM(MEMBER, 2 * env.action_dim)  # mean and log variance
     opt, member_opt = optax.scale_by_adam(), optax.adam(args.ensemble_lr)
     parts = {"env": env, "net": net, "opt": opt, "member": member, "member_opt": member_opt}
-    iterations = planned_iterations(args)
+    iterations = arguments.planned_iterations(args)
     run = Run(args, env.config, iterations, SHOWN)
     (state,) = run.start(partial(init_state, **parts))
     print(f"{args.robot}: x {env.prop_dim}, action {env.action_dim}, engine {type(env.engine).__name__}")
@@ -560,7 +557,7 @@ def explore(args):
     shardings = devices.of_state(state, axis=0)
     state = devices.place(state, shardings)
 
-    @partial(jax.jit, donate_argnums=0, out_shardings=(shardings, devices.replicated()))
+    @partial(jax.jit, donate_argnums=0, out_shardings=(shardings, devices.replicated()))  # in place: the ring is large
     def collect_chunk(state):
         return jax.lax.scan(lambda s, _: iteration(args, state=s, **parts), state, None, args.log_every)
 

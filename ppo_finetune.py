@@ -22,7 +22,7 @@ import tyro
 
 import envs
 from experiment import arguments, checkpoints, devices, metrics, records
-from experiment.run import Run, make_env, planned_iterations, stack, unstack
+from experiment.run import Run, make_env, stack, unstack
 
 SHIPPED = Path(__file__).parent / "assets/pidm"  # <robot>.msgpack: pretrained weights and input normalisation
 jax.config.update("jax_default_matmul_precision", "highest")  # TF32 of recent GPUs changes what is learned
@@ -40,7 +40,7 @@ class Args:
     policy: str | None = None  # start from the networks of this policy.msgpack (not its std); same network and obs
     # where the weights of --pretrained go; shuffled: into both, permuted; none: its input normalisation alone
     load_into: Literal["both", "actor", "critic", "history_encoder", "shuffled", "none"] = "both"
-    # Deviation (weight init): rsl_rl has PyTorch's; with orthogonal weights both quadrupeds learn faster.
+    # Deviation (weight init): rsl_rl has PyTorch's, pytorch_unscaled; pytorch: the actor's last layer a hundredth.
     weight_init: Literal["orthogonal", "pytorch", "pytorch_unscaled"] = "orthogonal"  # of layers that are not loaded
     preset: Literal["smoke", "cpu", "gpu"] = "cpu"  # scale: 4, 256 (parkour 512) or 4096 environments
     seed: int = 0  # the only source of randomness
@@ -191,7 +191,7 @@ class ActorCritic(nn.Module):
     weight_init: str = "orthogonal"
 
     def setup(self):
-        self.actor = MLP((*self.hidden, self.action_dim), 0.01, self.weight_init)  # the first actions are ~0
+        self.actor = MLP((*self.hidden, self.action_dim), 0.01, self.weight_init)  # the first mean actions are ~0
         self.critic = MLP((*self.hidden, 1), 0.05, self.weight_init)
         # Deviation (log std): rsl_rl learns the std itself.
         self.log_std = self.param("log_std", nn.initializers.constant(jnp.log(self.init_std)), (self.action_dim,))
@@ -226,7 +226,7 @@ class PIDMActorCritic(nn.Module):
 
     def setup(self):
         branch = partial(PIDMBranch, self.sizes, weight_init=self.weight_init)
-        self.actor = branch(self.action_dim, "action_synthesizer", gain=0.003)  # the first actions are ~0
+        self.actor = branch(self.action_dim, "action_synthesizer", gain=0.003)  # < 0.02 behind loaded weights, too
         self.critic = branch(1, "value_synthesizer", gain=0.05)
         self.log_std = self.param("log_std", nn.initializers.constant(jnp.log(self.init_std)), (self.action_dim,))
         for name, width in (("prop", self.prop_dim), ("action", self.action_dim)):
@@ -283,8 +283,8 @@ def shuffle_weights(tree, key):
 def warm_start(args, env, params, key):
     """Set a PIDM's input normalisation and, with --pretrained, load history_encoder and backbone (paper Sec. IV-E).
 
-    --load-into names what to load. Without --pretrained the shipped PIDM's normalisation is used: the two differ in
-    weights alone. UserError if the file is missing or of another robot, action scale, dt, x or K.
+    --load-into names what to load. Without --pretrained the normalisation is the shipped PIDM's; beside a PIDM of your
+    own give it with --load-into none. UserError if the file is missing or of another robot, action scale, dt, x or K.
     """
     path = Path(args.pretrained or SHIPPED / f"{env.robot.name}.msgpack")
     core = {name: params["params"]["actor"][name] for name in ("history_encoder", "backbone")}
@@ -297,7 +297,7 @@ def warm_start(args, env, params, key):
     branches = {"actor": ["actor"], "critic": ["critic"], "none": []}.get(args.load_into, ["actor", "critic"])
     loaded = {branch: params["params"][branch] | core for branch in (branches if args.pretrained else [])}
     for branch in loaded:
-        print(f"{branch}: loaded {' and '.join(core)} from {path}")
+        print(f"{branch}: {'shuffled' if args.load_into == 'shuffled' else 'loaded'} {' and '.join(core)} from {path}")
     return {"params": params["params"] | loaded, "normalizer": jax.tree.map(jnp.asarray, pidm["normalizer"])}
 
 
@@ -309,8 +309,8 @@ class TrainState:
     params: dict  # as Flax has it: "params", the weights, and "normalizer" of a PIDM, which gets no gradient
     opt_state: optax.OptState
     lr: jax.Array  # ()
-    env: envs.base.State  # (N, ...)
-    key: jax.Array  # of the seed: each iteration folds in its number
+    env_state: envs.base.State  # (N, ...)
+    key: jax.Array  # of this seed, since several train at once: each iteration folds in its number
     iteration: jax.Array  # () PPO iterations done
 
 
@@ -490,7 +490,7 @@ def update(args, env, net, opt, state, batch, key):
 def iteration(args, env, net, opt, state):
     """One PPO iteration: rollout, advantages, update. Noise and shuffles come from (seed, iteration) alone."""
     k_roll, k_update = jax.random.split(jax.random.fold_in(state.key, state.iteration))
-    env_state, (roll, report) = rollout(args, env, net, state.params, state.env, k_roll)
+    env_state, (roll, report) = rollout(args, env, net, state.params, state.env_state, k_roll)
     last_value = net.apply(state.params, net.inputs(env_state.obs, env_state.history), method=net.value)
     # a time limit is no end of the task: the value of what would follow is added to the reward
     advantage, ret = gae(args, roll.reward + roll.bootstrap, roll.done, roll.value, last_value)
@@ -499,7 +499,7 @@ def iteration(args, env, net, opt, state):
     report |= metrics.update_magnitude(state.params, new.params) if args.network == "pidm" else {}
     report["explained_variance"] = 1 - jnp.var(ret - roll.value) / (jnp.var(ret) + 1e-8)
     report |= {"lr": new.lr, "action_std": jnp.exp(new.params["params"]["log_std"]).mean()}
-    return new.replace(env=env_state, iteration=state.iteration + 1), report
+    return new.replace(env_state=env_state, iteration=state.iteration + 1), report
 
 
 def init_state(args, env, net, opt):
@@ -518,7 +518,7 @@ def init_state(args, env, net, opt):
 
 
 def make_chunk(args, env, net, opt, states):
-    """Compile log_every iterations of all seeds: TrainStates (S, ...) -> the same, and metrics (S, log_every)."""
+    """Return log_every iterations of all seeds, jitted: states (S, ...) -> the same, and metrics (S, log_every)."""
 
     def one_seed(state):
         return jax.lax.scan(lambda s, _: iteration(args, env, net, opt, s), state, None, args.log_every)
@@ -534,7 +534,7 @@ def train(args):
     env = make_env(partial(envs.make, robust=args.robust, robot=args.robot), args.task, args)
     args = merge(args, env.config.ppo)
     net, opt = make_net(args, env), optax.scale_by_adam()  # `update` multiplies by the adapted step size
-    run = Run(args, env.config, planned_iterations(args), SHOWN)
+    run = Run(args, env.config, arguments.planned_iterations(args), SHOWN)
     states = stack(run.start(partial(init_state, env=env, net=net, opt=opt)))  # leaves (S, ...)
     print(f"{args.task}: observation {env.obs_dim}, action {env.action_dim}, engine {type(env.engine).__name__}")
     states = devices.place(states, devices.of_state(states, axis=1))

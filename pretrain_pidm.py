@@ -38,7 +38,7 @@ class Args:
     data: str = "runs/explore/go1/seed0"  # folder of a finished ppo_explore.py
     preset: Literal["smoke", "cpu", "gpu"] = "cpu"  # scale
     seed: int = 0  # the only source of randomness
-    eval: str | None = None  # instead of training, validate this pidm.msgpack on held-out data; figures go beside it
+    eval: str | None = None  # validate this pidm.msgpack instead; replaces validation.json and the figures beside it
     # --- Records ---
     run_dir: str | None = None  # None: runs/pidm/<robot>/seed<seed>
     force: bool = False  # overwrite the run in that folder
@@ -176,15 +176,15 @@ class Dataset:
 
     def windows(self, index):
         """Transitions by flat index (B,): prop (B, K+1, X), past (B, K, A), next_x (B, X), action (B, A), pad (B,)."""
-        steps, env = np.divmod(index, self.x.shape[1])
-        start = steps - self.age[steps, env]
+        steps, column = np.divmod(index, self.x.shape[1])
+        start = steps - self.age[steps, column]
         rows = steps[:, None] + np.arange(-self.meta["history"], 1)
-        past = self.action[np.maximum(rows[:, :-1], 0), env[:, None]]
+        past = self.action[np.maximum(rows[:, :-1], 0), column[:, None]]
         return {
-            "prop": self.x[np.maximum(rows, start[:, None]), env[:, None]],
+            "prop": self.x[np.maximum(rows, start[:, None]), column[:, None]],
             "past": past * (rows[:, :-1] >= start[:, None])[..., None],
-            "next_x": self.x[steps + 1, env],
-            "action": self.action[steps, env],
+            "next_x": self.x[steps + 1, column],
+            "action": self.action[steps, column],
             "pad": np.maximum(start - rows[:, 0], 0),
         }
 
@@ -287,7 +287,7 @@ def decay(args, val_errors):
 
 
 def make_step(args, env, net, opt):
-    """Return an Adam step, compiled: variables, opt_state, batch (to augment), key, lr -> the first two, loss ()."""
+    """Return a jitted Adam step: variables, opt_state, batch (to augment), key, lr -> the first two, loss ()."""
 
     @partial(jax.jit, out_shardings=devices.replicated())
     def step(variables, opt_state, batch, key, lr):
@@ -398,7 +398,7 @@ def commanded_change(env, x, action):
 
 
 def make_predictor(args, env, net):
-    """Return `predict` with the tasks' sensor noise, compiled: variables, batch, key -> action (B, A)."""
+    """Return `predict` with the tasks' sensor noise, jitted: variables, batch, key -> action (B, A)."""
     width = args.noise * noise_width(env)
     return jax.jit(lambda variables, batch, key: predict(net, variables, add_noise(key, width, batch)))
 

@@ -1,7 +1,7 @@
 """The parts that all tasks share: State, one control step, noise, history, randomisation, reset, mirrors.
 
 `env.reset(key) -> State` and `env.step(state, action) -> State` are pure functions of one environment. Scripts vmap
-them. A task family subclasses `Env`; locomotion.py is the simplest.
+them. A task family subclasses `Env`; pedipulation.py is the shortest.
 Legend: A joints and actions, F feet, O observation, X proprioception x_t (6 + 2A), K history length, M obstacles.
 """
 
@@ -46,7 +46,7 @@ class State:
     history: dict  # prop (K+1, X) in SI units, noisy; action (K, A); oldest first
     reward: jax.Array  # ()
     terminated: jax.Array  # () bool: failure, the return ends here
-    truncated: jax.Array  # () bool: time limit, the return goes on with V(final_obs)
+    truncated: jax.Array  # () bool: time limit, no failure; whether the return goes on: `Env.bootstrap_time_outs`
     final_obs: jax.Array  # (O,)
     final_history: dict
     action: jax.Array  # (A,) of the last step, 0 at the start

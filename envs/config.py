@@ -19,7 +19,7 @@ class Config:
 
     robot: str
     weights: dict[str, float]  # reward term -> weight
-    ppo: dict  # the task's own PPO settings, which ppo_finetune.py reads
+    ppo: dict  # the task's own PPO settings, which `merge` of stages 1 and 3 reads
     robust: dict = field(default_factory=dict)  # fields that --robust replaces, for use on a robot; {}: none
     body: dict = field(default_factory=dict)  # of a robot from a file, see loader.py; {}: `robot` is a shipped one
     episode_seconds: float = 20.0

@@ -48,7 +48,7 @@ class LocomotionConfig(Config):
 class Task(FootClocks):
     """State of velocity tracking."""
 
-    command: jax.Array  # (3,) forward [m/s], sideways [m/s], turning [rad/s], base frame
+    command: jax.Array  # (3,) forward [m/s], sideways [m/s], turning [rad/s], in the frame of `tracked_velocity`
     heading: jax.Array  # () commanded yaw [rad]
     moves: jax.Array  # () bool: not drawn to stand still; it may yet be slower than `rewards.moving`
     steers: jax.Array  # () bool: the heading sets the turning rate
@@ -210,7 +210,7 @@ class G1Locomotion(Locomotion):
         }
 
     def tracked_velocity(self, motion):
-        """As in every task, in the heading frame: a trunk that leans or pitches loses no reward."""
+        """In the heading frame, not the base's: a trunk that leans or pitches loses no reward."""
         lin_vel, ang_vel = (in_heading(motion.yaw, rotate(motion.quat, v)) for v in (motion.lin_vel, motion.ang_vel))
         return jnp.append(lin_vel[:2], ang_vel[2])
 

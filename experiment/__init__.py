@@ -1,1 +1,1 @@
-"""Everything around the algorithm: run folders, files, progress, figures and devices. Nothing in here learns."""
+"""Everything around the algorithm: arguments, files, progress, figures, devices, gaits. Nothing in here learns."""

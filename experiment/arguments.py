@@ -7,7 +7,7 @@ from pathlib import Path
 
 import jax
 
-from envs.config import fits
+from envs.config import FIXED, fits
 from experiment import records
 
 ABOVE_0 = ("lr", "max_lr", "ensemble_lr", "desired_kl", "init_std", "clip", "max_grad_norm")  # flags of all scripts
@@ -46,6 +46,29 @@ def check_minibatches(args):
             "change --num-minibatches or --num-envs"
         )
     return args
+
+
+def set_fields(words):
+    """Fields of a config as typed after --set, name -> text. UserError for those that cannot be set."""
+    for word in words:
+        if "=" not in word:
+            raise records.UserError(f"--set takes NAME=VALUE, not {word!r}")
+        if (name := word.split("=", 1)[0]) in FIXED:
+            raise records.UserError(f"{name} cannot be set: {FIXED[name]}")
+    return dict(word.split("=", 1) for word in words)
+
+
+def planned_iterations(args):
+    """Iterations in whole chunks of log_every that make at least total_steps."""
+    return -(-args.total_steps // (args.num_envs * args.num_steps * args.log_every)) * args.log_every
+
+
+def each_seed(args):
+    """Arguments of every training of a run. With --num-seeds their folders are <run_dir>/seed<k>."""
+    if getattr(args, "num_seeds", 1) == 1:
+        return [args]
+    seeds = range(args.seed, args.seed + args.num_seeds)
+    return [dataclasses.replace(args, seed=s, run_dir=f"{args.run_dir}/seed{s}", num_seeds=1) for s in seeds]
 
 
 def resumed(args, *may_change):

@@ -13,7 +13,7 @@ from experiment import records
 
 
 def save(path, params, meta):
-    """Write weights and a JSON-able dict that describes them as one msgpack file."""
+    """Write weights, and a JSON-able dict about them, as one msgpack file."""
     blob = flax.serialization.msgpack_serialize(
         {
             "params": flax.serialization.to_state_dict(jax.device_get(params)),
@@ -65,7 +65,7 @@ def load_networks(path, like, env):
 def load_pidm(path, env, like):
     """Params and normalizer of a PIDM checkpoint, of which the parts in `like` (same keys) are returned.
 
-    UserError if it was made for another robot, layout of x or K, or if a part has other shapes.
+    UserError if it was made for another robot, body, layout of x, K, action scale or dt, or if a part has other shapes.
     """
     if not path.exists():
         ways = "--pretrained names one; with --load-into none only its input normalisation is used"
@@ -102,13 +102,13 @@ def finite(tree):
     return all(jnp.isfinite(leaf).all() for leaf in jax.tree.leaves(tree))
 
 
-def save_state(out, state, rows):
+def save_state(folder, state, rows):
     """Write the whole state of a run, from which it goes on to the same bits, and its rows so far."""
     leaves = jax.device_get([jax.random.key_data(x) if is_key(x) else x for x in jax.tree.leaves(state)])
     blob = flax.serialization.msgpack_serialize(
         {"leaves": {str(i): np.asarray(x) for i, x in enumerate(leaves)}, "rows": json.dumps(rows)}
     )
-    records.replace_bytes(out / records.STATE, blob)
+    records.replace_bytes(folder / records.STATE, blob)
 
 
 def load_state(folder, like):

@@ -92,8 +92,10 @@ def split(axis):
 
 
 def of_state(state, axis):
-    """Shardings of a TrainState: its environments, on this axis of `env`, are split."""
-    return jax.tree.map(lambda _: replicated(), state).replace(env=jax.tree.map(lambda _: split(axis), state.env))
+    """Shardings of a TrainState: its environments, on this axis of `env_state`, are split."""
+    return jax.tree.map(lambda _: replicated(), state).replace(
+        env_state=jax.tree.map(lambda _: split(axis), state.env_state)
+    )
 
 
 def place(tree, shardings):

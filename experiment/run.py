@@ -1,4 +1,4 @@
-"""One run of a script: its folders, rows, progress and how it stops.
+"""One run of a script: its environment, folders, rows, progress and how it stops.
 
 Stage 3 may train several seeds, each in a folder. The scripts use it so:
 
@@ -18,43 +18,19 @@ import jax
 import jax.numpy as jnp
 
 from envs import loader
-from envs.config import FIXED
 from experiment import arguments, checkpoints, devices, figures, metrics, records
 from experiment.progress import Progress
-
-
-def typed(words):
-    """Fields of a config as typed after --set, name -> text. UserError for those that cannot be set."""
-    for word in words:
-        if "=" not in word:
-            raise records.UserError(f"--set takes NAME=VALUE, not {word!r}")
-        if (name := word.split("=", 1)[0]) in FIXED:
-            raise records.UserError(f"{name} cannot be set: {FIXED[name]}")
-    return dict(word.split("=", 1) for word in words)
 
 
 def make_env(make, name, args, **fields):
     """Build make(name, engine) with these fields of its config and then those of --set, or raise a UserError."""
     devices.find()
     try:
-        env = make(name, args.engine, **fields | typed(args.set))
+        env = make(name, args.engine, **fields | arguments.set_fields(args.set))
         devices.check_engine(env.engine)
         return env
     except (ValueError, ImportError) as error:
         raise records.UserError(str(error)) from None
-
-
-def planned_iterations(args):
-    """Iterations in whole chunks of log_every that make at least total_steps."""
-    return -(-args.total_steps // (args.num_envs * args.num_steps * args.log_every)) * args.log_every
-
-
-def each_seed(args):
-    """Arguments of every training of a run. With --num-seeds their folders are <run_dir>/seed<k>."""
-    if getattr(args, "num_seeds", 1) == 1:
-        return [args]
-    seeds = range(args.seed, args.seed + args.num_seeds)
-    return [dataclasses.replace(args, seed=s, run_dir=f"{args.run_dir}/seed{s}", num_seeds=1) for s in seeds]
 
 
 class Run:
@@ -64,7 +40,7 @@ class Run:
         """args and config are recorded in args.json; total: iterations of the run; for the rest see Progress."""
         self.args, self.config, self.total, self.shown, self.over = args, config, total, shown, over
         self.body = getattr(config, "body", {})  # of a robot from a file
-        self.each_args = each_seed(args)
+        self.each_args = arguments.each_seed(args)
         self.folders = [Path(one.run_dir) if devices.is_first() else None for one in self.each_args]
         self.rows = [[] for _ in self.each_args]
         self.iteration, self.stopped = 0, False

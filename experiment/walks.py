@@ -1,7 +1,8 @@
 """Walks of a policy under fixed commands on flat ground, then with a delay, a push, a load and on a slippery floor.
 
-env, net, params, _ = play.load_nominal(path)
-by_command, summary = walks.evaluate(env, net, params)
+    by_command, summary = walks.evaluate(*play.load_nominal(path)[:3])
+
+Legend: T control steps, N episodes side by side.
 """
 
 from functools import partial
@@ -42,7 +43,7 @@ def body(env):
 
 
 def drive(env, net, params, state, commands, kicks):
-    """Follow commands (T, N, 3) and add kicks (T, N, 2) [m/s] to the base's velocity; `observed`, with leading T, N."""
+    """Follow commands (T, N, 3), with kicks (T, N, 2) [m/s] to the base. What `observed` returns, as (T, N, ...)."""
 
     def step(state, inputs):
         command, kick = inputs

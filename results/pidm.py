@@ -115,7 +115,7 @@ def early_states(task, count=20_000):
     x = []
     for _ in range(EARLY):
         state = step(state)
-        x.append(np.asarray(state.env.history["prop"][:, -1]))
+        x.append(np.asarray(state.env_state.history["prop"][:, -1]))
     x = np.concatenate(x)
     return x[np.linspace(0, len(x) - 1, count).astype(int)]
 
@@ -155,7 +155,7 @@ def first_features(task, **choice):
 
     @jax.jit
     def features(state):
-        _, (roll, _) = ppo_finetune.rollout(args, env, net, state.params, state.env, state.key)
+        _, (roll, _) = ppo_finetune.rollout(args, env, net, state.params, state.env_state, state.key)
         _, outputs = net.apply(state.params, roll.inputs, capture_intermediates=True, mutable=["intermediates"])
         return nn.elu(outputs["intermediates"]["actor"]["backbone"]["__call__"][0]), roll.mean
 

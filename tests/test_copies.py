@@ -1,7 +1,9 @@
-"""Scripts that must stand alone carry copies of some code. Each must match the one in its owner, byte for byte.
+"""Scripts that must stand alone carry copies of some code.
 
-pytest tests/test_copies.py               # fails with a diff when a copy has drifted
-python tests/test_copies.py               # rewrites every copy from its owner
+    pytest tests/test_copies.py               # fails with a diff when a copy has drifted
+    python tests/test_copies.py               # rewrites every copy from its owner
+
+Each must match the one in its owner, byte for byte.
 """
 
 import ast

@@ -190,7 +190,7 @@ def test_disagreement_is_the_variance_over_members():
 
 
 def test_bootstrap_draws_differ_per_member_and_stay_within_the_data():
-    draws = np.asarray(script.bootstrap_indices(jax.random.key(0), (8, 5, 512), 1000))
+    draws = np.asarray(script.draw_indices(jax.random.key(0), (8, 5, 512), 1000))
     assert draws.max() < 1000 and len(np.unique(draws[0, 0])) < 512  # with replacement
     for member in range(1, 5):
         assert (draws[:, member] == draws[:, 0]).mean() < 0.01
@@ -265,7 +265,7 @@ def test_first_clocks_are_spread():
     net, member = script.ActorCritic((8,), 12, 1.0), script.PIDM(script.MEMBER, 24)
     opt = optax.scale_by_adam()
     state = script.init_state(args, env, net, opt, member, opt)
-    clocks = np.asarray(state.env.clock)
+    clocks = np.asarray(state.env_state.clock)
     assert clocks.min() < 200 and 800 < clocks.max() < env.episode_steps
     for name, x in state.ensemble.norm.items():
         assert (np.asarray(x) == name.endswith("std")).all(), "inputs are as they are until they were measured"

@@ -424,7 +424,7 @@ def test_iteration_of_stage_three(network, piece, monkeypatch):
         _, part, module = name.split("/")
         old, new = (tree["params"][part][module] for tree in (float64(params), want.params))
         compare(report[name], np.mean([np.abs(new[i]["kernel"] - old[i]["kernel"]).mean() for i in new]))
-    assert after.iteration == 6 and int(after.env.clock[0]) == T
+    assert after.iteration == 6 and int(after.env_state.clock[0]) == T
 
 
 class FoundError(Exception):

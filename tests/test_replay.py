@@ -27,8 +27,8 @@ def test_a_robot_that_fails_is_found_and_dumped(run, capsys):
     out, state = run
     replay.main(replay.Args(str(out), iterations=1))
     assert "nothing failed from iteration 4 to 4" in capsys.readouterr().out and not (out / "nan.npz").exists()
-    qvel = state.env.physics.qvel.at[2, 2].set(2000.0)
-    broken = state.replace(env=state.env.replace(physics=state.env.physics.replace(qvel=qvel)))
+    qvel = state.env_state.physics.qvel.at[2, 2].set(2000.0)
+    broken = state.replace(env_state=state.env_state.replace(physics=state.env_state.physics.replace(qvel=qvel)))
     checkpoints.save_state(out, broken, [])
     replay.main(replay.Args(str(out)))
     assert f"iteration {int(state.iteration)}, step 0: 1 of 4 environments failed" in capsys.readouterr().out
@@ -36,7 +36,7 @@ def test_a_robot_that_fails_is_found_and_dumped(run, capsys):
         assert dump["environment"].tolist() == [2] and dump["task"] == "go1_loco"
         assert dump["qpos"].shape[1:] == (1, 19) and dump["ctrl"].shape[1:] == (1, 12)
         np.testing.assert_array_equal(dump["qvel"][0, 0], qvel[2])
-        assert dump["xfrc_applied"].shape[1:] == (1, *state.env.physics.wrench.shape[1:])
+        assert dump["xfrc_applied"].shape[1:] == (1, *state.env_state.physics.wrench.shape[1:])
     replay.main(replay.Args(str(out / "nan.npz")))
     out = capsys.readouterr().out
     assert "environment 2: " in out and out.count("physics step") == 5, "it has the config of the run"

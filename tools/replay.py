@@ -46,7 +46,7 @@ DUMPED = ("qpos", "qvel", "ctrl", "mocap_pos", "mocap_quat", "xfrc_applied")
 def trace(args, env, net, state):
     """One rollout: what is in DUMPED of each step, and where one failed; each (T, N, ...)."""
     k_roll, _ = jax.random.split(jax.random.fold_in(state.key, state.iteration))
-    _, (roll, _) = ppo_finetune.rollout(args, env, net, state.params, state.env, k_roll)
+    _, (roll, _) = ppo_finetune.rollout(args, env, net, state.params, state.env_state, k_roll)
 
     def step(before, action):
         after = jax.vmap(env.step)(before, action)
@@ -55,7 +55,7 @@ def trace(args, env, net, state):
         given = physics.mocap_pos, physics.mocap_quat, physics.wrench
         return after, (physics.qpos, physics.qvel, target, *given, ~sound | after.metrics["diverged"])
 
-    return jax.lax.scan(step, state.env, roll.action)[1]
+    return jax.lax.scan(step, state.env_state, roll.action)[1]
 
 
 def find(folder, iterations, robots):
