@@ -16,7 +16,7 @@ test: .venv/installed
 	JAX_PLATFORMS=cpu $(BIN)/python -m pytest -q -n auto --dist loadfile --no-loadscope-reorder tests
 
 .venv/installed: requirements.txt
-	@$(PYTHON) -c "import sys; v = sys.version.split()[0]; sys.version_info >= (3, 11) or sys.exit( \
+	@$(PYTHON) -c "import sys; v = sys.version.split()[0]; (3, 11) <= sys.version_info[:2] <= (3, 13) or sys.exit( \
 	  f'error: this needs Python 3.11 to 3.13, here is {v}; give another, as in make demo PYTHON=python3.12')"
 	$(PYTHON) -m venv .venv
 	$(BIN)/python -m pip install -q -r requirements.txt

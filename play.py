@@ -3,7 +3,7 @@
     python play.py results/tasks/go1_loco/policy.msgpack --out runs/look
     python play.py results/tasks/go1_loco/policy.msgpack --video go1.gif
     python play.py results/tasks/anymal_climb_up/policy.msgpack --web --level 3
-    python play.py results/tasks/go1_loco/policy.msgpack --export go1.onnx
+    python play.py results/tasks/go1_robust/policy.msgpack --export go1.onnx
 
 By default it evaluates the mean action, and writes eval.json, rollout.png and rollout.gif beside the policy, or to
 --out. The task stands in the policy file.
@@ -257,7 +257,7 @@ def export_onnx(args):
     }
     onnx.helper.set_model_props(model, {name: json.dumps(value) for name, value in facts.items()})
     records.write(Path(args.export), model.SerializeToString())
-    print(f"wrote {args.export}")
+    print(f"wrote {args.export}" + ("" if facts["robust"] else "; trained without --robust: for simulation only"))
 
 
 # --- Main ---

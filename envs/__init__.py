@@ -48,7 +48,10 @@ def label(task, robot=None):
     """Name of a task for folders, after that of the robot if it has a file; or of a robot, by its name or file."""
     if robot:
         return f"{label(robot)}_{task}"
-    return loader.name_of(Path(task)) if Path(task).suffix else task
+    if not Path(task).suffix:
+        return task
+    name = loader.name_of(Path(task))
+    return f"{name}_file" if name in EXPLORE else name  # not in the folders of the shipped robot
 
 
 def make(task, engine="auto", /, robust=False, robot=None, **overrides):

@@ -227,6 +227,15 @@ def differences(model, data, reflection, b, other):
     }
 
 
+MOTOR = {
+    "kp": 0.02,
+    "torque_limit": 0.02,
+    "action_scale": 0.02,
+    "kd": 0.1,
+    "armature": 0.1,
+}  # -> by how much images may differ
+
+
 def joint_images(model, data, reflection, images, body):
     """Image and sign of each joint, or None: axes, limits, pose and motors must be reflections of each other."""
     perm, signs = [], []
@@ -243,7 +252,7 @@ def joint_images(model, data, reflection, images, body):
             return None
     pose, limits = np.array(body["default_pose"]), model.jnt_range[1:]
     swapped = np.where(np.array(signs)[:, None] > 0, limits[perm], -limits[perm][:, ::-1])
-    alike = all(np.allclose(np.array(body[name])[perm], body[name], rtol=0.02) for name in ("kp", "torque_limit"))
+    alike = all(np.allclose(np.array(body[name])[perm], body[name], rtol=most) for name, most in MOTOR.items())
     same = np.allclose(signs * pose[perm], pose, atol=0.02) and np.allclose(swapped, limits, atol=0.05) and alike
     return {"joints": perm, "signs": signs} if same else None
 

@@ -69,6 +69,8 @@ def load(path):
         return recorded(path)
     path, wishes = read_wishes(path)
     spec, notes = reader.read(path), []
+    if given := sorted(wishes.keys() - {"file"}):
+        notes.append(f"robot.toml gives {', '.join(given)}")
     refuse_what_cannot_be_walked(path, spec)
     base = reader.free_the_base(path, spec, notes)
     if spec.tendons or any(one.gravcomp for one in spec.bodies):
@@ -246,8 +248,9 @@ def default_pose(path, model, joints, wishes):
     pose = wished(wishes.get("pose"), names, pose)
     if None in pose:
         lacking = [name for name, angle in zip(names, pose, strict=True) if angle is None]
+        which = f"uses none of its keyframes {', '.join(keys)}; choose one, or" if keys else "has no keyframe;"
         raise ValueError(
-            f"{path} has no keyframe; write the angles [rad] it stands with into robot.toml, [pose] {lacking[0]} = 0.0 "
+            f"{path} {which} write the angles [rad] it stands with into robot.toml, [pose] {lacking[0]} = 0.0 "
             f"(joints: {', '.join(lacking)}; a part of a name stands for all that have it)"
         )
     low, high = model.jnt_range[joints].T
@@ -297,6 +300,8 @@ def motors_of(path, model, joints, pose, wishes, notes):
     if min(*limits, *kp, *kd, *scale) <= 0:
         raise ValueError(f"{path}: gains, torque limits and action scales must be above 0")
     notes += left_out(model, joints, driven, gains[:, 1])
+    if path.suffix == ".urdf":
+        notes.append("limits of joint velocity are left out: motors are as strong at any speed")
     return {
         "kp": kp,
         "kd": kd,

@@ -39,7 +39,8 @@ def shared(body):
 def loco(body):
     """Config of velocity tracking for a body."""
     weights, steps = scaled(GO1_LOCO.weights, body), scaled(STEP_WEIGHTS, body)
-    robust = {"added_mass": tuple(body["added_mass"]), "joint_friction": (0.0, 0.01 * max(body["torque_limit"]))}
+    friction = min(0.01 * max(body["torque_limit"]), 0.05 * min(body["torque_limit"]))  # one number for all joints
+    robust = {"added_mass": tuple(body["added_mass"]), "joint_friction": (0.0, friction)}
     if len(body["feet"]) > 2:
         robust |= ROBUST_QUADRUPED | {"weights": weights | steps, "gait_hz": 2.8, "stance": 0.5}
         return dataclasses.replace(GO1_LOCO, **shared(body), weights=weights, robust=robust)

@@ -145,6 +145,16 @@ def test_robot_toml_goes_before_the_file(write):
     assert body["mirrors"] == {} and any("no symmetry" in note for note in body["notes"])
 
 
+@pytest.mark.parametrize("field", ["kp", "kd", "torque_limit", "armature", "action_scale"])
+def test_legs_whose_motors_differ_are_no_images(write, field):
+    """Fault: mirrored samples of another motion, since an action moves one leg farther than the other."""
+    alike, unlike = (
+        loader.load(write(quadruped(), f"{field} = {value}")) for value in ("0.3", "{ FL = 0.6, '' = 0.3 }")
+    )
+    assert "left_right" in alike["mirrors"] and "left_right" not in unlike["mirrors"]
+    assert f"robot.toml gives {field}" in alike["notes"]
+
+
 def test_a_robot_toml_of_another_file_does_not_count(write):
     plain, other = (loader.load(write(quadruped(), toml)) for toml in ("", 'file = "a1.xml"\nkp = 99.0'))
     assert other == plain
@@ -389,7 +399,8 @@ REFUSED = {
         "keyframes 0, 1",
         'keyframe = "0"',
     ),
-    "no keyframe": (quadruped(keys=""), "[pose]", "FL_hip"),
+    "no keyframe": (quadruped(keys=""), "has no keyframe", "[pose]", "FL_hip"),
+    "a pose without one joint": (quadruped(keys=f"<keyframe>{TWO}</keyframe>"), "none of its keyframes crouch, sleep"),
     "a joint without limits": (
         quadruped().replace('axis="1 0 0" range="-0.8 0.8"', 'axis="1 0 0"', 1),
         "FL_hip",
@@ -405,7 +416,10 @@ REFUSED = {
         "z points up",
     ),
 }
-TOMLS = {"a pose beyond the limits": "pose = { FL_calf = 1.0 }"}
+TOMLS = {
+    "a pose beyond the limits": "pose = { FL_calf = 1.0 }",
+    "a pose without one joint": "pose = { thigh = 0.8, calf = -1.6 }",
+}
 
 
 @pytest.mark.parametrize("fault", REFUSED)
@@ -542,6 +556,8 @@ def test_folders_have_the_name_of_the_robot(write, tmp_path):
     assert envs.label("loco", str(tmp_path / "robot.toml")) == "dog_loco"
     assert envs.label(str(tmp_path / "robot.toml")) == envs.label(str(tmp_path / "dog.xml")) == "dog"
     assert (envs.label("go1_loco"), envs.label("go1")) == ("go1_loco", "go1")
+    theirs = str(write(quadruped(), name="go1.xml"))
+    assert (envs.label("loco", theirs), envs.label(theirs)) == ("go1_file_loco", "go1_file"), "not the shipped Go1's"
 
 
 def test_wrong_pairs_of_flags(refused, write):

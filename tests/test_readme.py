@@ -79,8 +79,12 @@ def workplace(tmp_path_factory):
     """A folder with what the commands read: assets, a recorded run, and the run that `make demo` leaves."""
     folder = tmp_path_factory.mktemp("readme")
     (folder / "assets").symlink_to(ROOT / "assets")
-    for copy in ("results/tasks/go1_loco", "runs/demo"):
-        shutil.copytree(ROOT / "results/tasks/go1_loco", folder / copy)
+    for copy, of in (
+        ("results/tasks/go1_loco",) * 2,
+        ("results/tasks/go1_robust",) * 2,
+        ("runs/demo", "results/tasks/go1_loco"),
+    ):
+        shutil.copytree(ROOT / of, folder / copy)
     return folder
 
 

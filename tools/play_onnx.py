@@ -1,11 +1,11 @@
 """Drive a robot in plain MuJoCo with an exported policy: without JAX, as on the robot's own computer.
 
-    python play.py results/tasks/go1_loco/policy.msgpack --export go1.onnx
+    python play.py results/tasks/go1_robust/policy.msgpack --export go1.onnx
     python tools/play_onnx.py go1.onnx --command 0.8 0 0 --seconds 10
     python tools/play_onnx.py go1.onnx --viewer
 
-It works for the locomotion tasks and needs requirements-export.txt. In the window of --viewer, arrow keys change the
-forward velocity and the turning rate, 7 and 9 the sideways velocity, and the space bar stops.
+It works for the locomotion tasks and needs mujoco, numpy, tyro and onnxruntime. In the window of --viewer, arrow keys
+change the forward velocity and the turning rate, 7 and 9 the sideways velocity, and the space bar stops.
 """
 
 import json
@@ -84,7 +84,10 @@ class Player:
         """MjSpec of the robot: of assets, or what the policy file holds of a robot that was loaded from a file."""
         if "mjcf" in self.facts:
             return mujoco.MjSpec.from_string(self.facts["mjcf"])
-        return mujoco.MjSpec.from_file(str(ROOT / f"assets/{self.facts['robot']}.xml"))
+        path = ROOT / f"assets/{self.facts['robot']}.xml"
+        if not path.exists():
+            raise FileNotFoundError(f"{path} is missing; this script belongs into tools/ of a checkout")
+        return mujoco.MjSpec.from_file(str(path))
 
     def set_gains(self):
         """Give the motors the gains and limits of the policy file, whatever the MJCF has."""
@@ -189,23 +192,34 @@ def fail(text):
     sys.exit(2)
 
 
+def open_player(path):
+    """The Player of a policy file, or one line and exit code 2."""
+    try:
+        player = Player(path)
+    except ImportError:
+        fail("onnxruntime is missing: pip install onnxruntime")
+    except FileNotFoundError as error:
+        fail(str(error))
+    except Exception:  # onnxruntime has no common error class
+        fail(f"{path} is not a policy; write one with play.py POLICY --export FILE")
+    unknown = player.shapes.keys() - player.readings(np.zeros(3)).keys() - {"prop_history", "action_history"}
+    if unknown:
+        fail(f"{path} reads {', '.join(sorted(unknown))}, which only the environments of this project provide")
+    if "phase" in player.shapes and "gait_hz" not in player.facts:
+        fail(f"{path} has a gait clock, but its metadata lack gait_hz; export it anew")
+    return player
+
+
 def main(args):
     """Drive the robot, in a window or for some seconds. Bad input gets one line and exit code 2."""
     if not 0.1 <= args.seconds <= 3600:
         fail(f"--seconds must be from 0.1 to 3600, not {args.seconds}")
-    try:
-        player = Player(args.policy)
-    except ImportError:
-        fail("onnxruntime is missing: pip install -r requirements-export.txt")
-    except Exception:  # onnxruntime has no common error class
-        fail(f"{args.policy} is not a policy; write one with play.py POLICY --export FILE")
-    unknown = player.shapes.keys() - player.readings(args.command).keys() - {"prop_history", "action_history"}
-    if unknown:
-        fail(f"{args.policy} reads {', '.join(sorted(unknown))}, which only the environments of this project provide")
-    if "phase" in player.shapes and "gait_hz" not in player.facts:
-        fail(f"{args.policy} has a gait clock, but its metadata lack gait_hz; export it anew")
+    player = open_player(args.policy)
     if args.viewer:
         return watch(player, args.command)
+    if (outside := np.clip(args.command, player.low, player.high) != args.command).any():
+        wide = ", ".join(f"{low:g} to {high:g}" for low, high in zip(player.low, player.high, strict=True))
+        print(f"the training had commands of {wide}; number {np.flatnonzero(outside)[0] + 1} is outside")
     velocity, falls = walk(player, args.command, args.seconds)
     print(f"commanded {np.round(args.command, 2)}, moved {np.round(velocity, 2)} [m/s, m/s, rad/s], {falls} falls")
     return None

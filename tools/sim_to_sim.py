@@ -1,6 +1,6 @@
 """Drive a policy on somebody else's model of its robot, and compare its gait with the one on our own model.
 
-    python play.py results/tasks/go1_loco/policy.msgpack --export go1.onnx
+    python play.py results/tasks/go1_robust/policy.msgpack --export go1.onnx
     python tools/sim_to_sim.py go1.onnx mujoco_menagerie/unitree_go1/go1.xml
 
 MODEL is an MJCF or URDF file. Both models are simulated alike, in plain MuJoCo: with explicit PD and the gains and
