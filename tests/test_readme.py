@@ -279,9 +279,12 @@ def test_main_use_is_what_was_recorded():
     run = "study/batch/g1_loco/pidm_pretrained/seed0"
     row, result = last_row(ROOT / "results" / run), read(run, "eval.json")["task"]
     text = " ".join(README.split())
-    assert f"run of {float(row['env_steps']) / 1e6:.0f} M, with 512 environments" in text
-    assert f"initial weights, took {float(row['seconds']) / 60:.0f} minutes" in text
+    assert f"seed 0 ({float(row['env_steps']) / 1e6:.0f} M, 512 environments, PyTorch's initial weights) took" in text
+    assert f"took {float(row['seconds']) / 60:.0f} minutes on one core" in text
     assert f"velocity by {result['lin_vel_error']:.2f} m/s and fell in {100 * result['falls']:.0f}% of" in text
+    switched = read(run, "eval.json")["gait"]
+    said = f"{switched['switches/falls']:.0f} of {switched['switches/episodes']:.0f} when commands change"
+    assert said in text
 
 
 def test_first_rows_of_a_second_training_are_what_was_recorded():
@@ -298,7 +301,7 @@ def test_robots_from_files_are_what_was_recorded():
     task, row = read("your_robot/h1", "eval.json")["task"], last_row(ROOT / "results/your_robot/h1")
     minutes = float(row["seconds"]) / 60
     assert f"After {minutes:.0f} minutes its velocity error was {task['lin_vel_error']:.2f} m/s" in text
-    assert f"and {gait['velocity_error']:.2f} at fixed commands to walk" in text
+    assert f"and {gait['velocity_error']:.2f} over the eleven fixed commands" in text
     assert f"rises by {100 * gait['clearance']:.0f} cm" in text
     assert f"{gait['switches/falls']:.0f} of {gait['switches/episodes']:.0f} at changing ones" in text
     for fault in ("delay of 40 ms", "friction 0.3"):
