@@ -251,7 +251,7 @@ def test_task_table_is_what_was_recorded(task):
     scale = f"{args['num_envs']} x {args['num_steps']}, {float(last['env_steps']) / 1e6:.1f} M steps"
     minutes = f"{float(last['seconds']) / 60:.1f} min"
     if "level" in last:
-        result = f"mean level {float(last['level']):.1f}"
+        result = f"{100 * report['level 9']['episode_success']:.0f}%"
     else:
         unit, error = ("m", "foot_error") if "foot_error" in last else ("m/s", "lin_vel_error")
         result = f"{report['task'][error]:.2f} {unit}, {100 * report['task']['falls']:.0f}%"
@@ -285,6 +285,38 @@ def test_main_use_is_what_was_recorded():
     switched = read(run, "eval.json")["gait"]
     said = f"{switched['switches/falls']:.0f} of {switched['switches/episodes']:.0f} when commands change"
     assert said in text
+
+
+def test_policies_for_use_are_what_was_measured():
+    """Every row of the table of robust policies, from the gait.json beside each."""
+    found = [read(f"tasks/{robot}_robust", "gait.json") for robot in ("go1", "anymal", "g1")]
+
+    def falls(of, *names):
+        each = [f"{name}/" if name else "" for name in names]
+        return "; ".join(f"{of[f'{name}falls']:.0f} of {of[f'{name}episodes']:.0f}" for name in each)
+
+    speeds = [[one["commands"][f"forward {x}"]["forward"] for x in (0.8, 1.0)] for one in found]
+    of = [one["summary"] for one in found]
+    still = ["it marches" if one["still"] < 0.5 else f"{100 * one['still']:.0f}%" for one in of]
+    rows = {
+        "yaw rate over its command, left and right": [
+            f"{a['yaw_slope_left']:.2f}, {a['yaw_slope_right']:.2f}" for a in of
+        ],
+        "speed [m/s] at 0.8; at 1.0": [f"{slow:.2f}; {fast:.2f}" for slow, fast in speeds],
+        "falls at fixed commands; at changing ones": [falls(a, "", "switches") for a in of],
+        "reverses from 0.8 to -0.6 m/s": [f"{a['reverse/reversed']:.0f} of {a['reverse/episodes']:.0f}" for a in of],
+        "told to stand: drift [m/s], time with still feet": [
+            f"{a['drift']:.2f}, {b}" for a, b in zip(of, still, strict=True)
+        ],
+        "strides a second; feet rise by, at 0.8 m/s": [
+            f"{a['stride_frequency']:.1f}; {1000 * a['clearance']:.0f} mm" for a in of
+        ],
+        "slip per metre, at 0.8 m/s": [f"{a['slip']:.2f}" for a in of],
+        "falls with 40 ms of delay; after a push of 1 m/s": [falls(a, "delay of 40 ms", "push of 1.0 m/s") for a in of],
+        "falls with 3 kg more; with a friction of 0.3": [falls(a, "3 kg more", "friction 0.3") for a in of],
+    }
+    for name, cells in rows.items():
+        assert f"| {name} | {' | '.join(cells)} |" in README.splitlines()
 
 
 def test_first_rows_of_a_second_training_are_what_was_recorded():
