@@ -77,6 +77,9 @@ def test_robots_start_on_the_ground(robot, starts):
         assert -1e-3 < gaps.min() < 1e-3, gaps
     scales = np.asarray(physics.mass_scale)[:, 2:]
     assert 0.85 <= scales.min() < 0.9 and 1.1 < scales.max() <= 1.15
+    assert np.ptp(scales, axis=1).min() > 0.1 and np.ptp(np.asarray(physics.qvel)[:, :6], axis=1).min() > 0, (
+        "each its own"
+    )
     assert np.ptp(np.asarray(physics.friction)) > 0.7
     qpos, qvel, w = np.asarray(physics.qpos), np.asarray(physics.qvel), env.config.spawn_velocity
     pose, (low, high) = np.array(env.robot.default_pose), env.config.spawn_joints
@@ -89,6 +92,28 @@ def test_robots_start_on_the_ground(robot, starts):
 def test_rough_ground_has_an_end(go1):
     where = jnp.array([[7.5, 0.0, 0.3], [7.5, 9.0, 0.3], [-1.0, 0.0, 0.3]])
     assert go1.on_rough(SimpleNamespace(qpos=where)).tolist() == [True, False, False]
+
+
+def test_explorers_are_pushed(starts):
+    """Along the ground, by up to 0.5 m/s each way, when it is time."""
+    env, state = starts("go1")
+    physics, keys = jax.tree.map(lambda x: x[:64], state.physics), jax.random.split(jax.random.key(0), 64)
+    push = jax.jit(jax.vmap(env.push, (0, 0, None, None)))
+    kicks = [np.asarray(push(keys, physics, 10, at)[0].qvel - physics.qvel) for at in (10, 11)]
+    assert 0.45 < np.abs(kicks[0][:, :2]).max() <= 0.5 + 1e-6 and not kicks[0][:, 2:].any() and not kicks[1].any()
+
+
+@pytest.mark.parametrize("robot", envs.EXPLORE)
+def test_todays_exploration_is_that_of_the_shipped_data(robot):
+    """Arguments and numbers of the environment are those of the collection that results/pidm records."""
+    record = json.loads((ROOT / f"results/pidm/{robot}/explore/meta.json").read_text())
+    today = script.merge(script.Args(robot=robot), envs.EXPLORE[robot].ppo), envs.EXPLORE[robot]
+    for was, now in zip((record["args"], record["config"]), today, strict=True):
+        now = json.loads(json.dumps(dataclasses.asdict(now)))
+        same = was.keys() & now.keys() - {"run_dir", "force", "spawn_xy"}
+        assert {name: was[name] for name in same} == {name: now[name] for name in same} and len(same) > 20
+    held_out = script.num_held_out(today[0])
+    assert record["validation_envs"] == [*range(256 - held_out, 256)] and held_out == 20
 
 
 def test_forces_come_and_go(starts):

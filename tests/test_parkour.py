@@ -135,10 +135,17 @@ def test_levels_are_what_the_table_says(level):
     stairs = (np.ptp(rise, axis=1) < 1e-4) & (tops[:, 0] > -10)
     assert 0.5 < stairs.mean() < 0.7
     np.testing.assert_allclose(np.abs(rise[stairs]), 0.05 + 0.2 * t, atol=1e-4)
+    assert 0.3 < (rise[stairs, 0] > 0).mean() < 0.7, "up and down"
+    uneven, most = tops[(tops[:, 0] > -10) & ~stairs], 0.05 + 0.2 * t
+    assert 0 <= uneven.min() < 0.1 * most and 0.9 * most < uneven.max() <= most + 1e-5
+    tiles = np.stack([slab(f"tile{i}", "climb_up", draw["climb_up"][0])[:, 2] for i in range(12)], 1)
+    tiles, most = tiles[tiles[:, 0] > -10] + courses.TILES[0].half[2], 0.02 + 0.06 * t
+    assert 0 <= tiles.min() < 0.1 * most and 0.9 * most < tiles.max() <= most + 1e-5
     tilt = slab("ramp", "walk", draw["walk"][0])
     tilt = tilt[tilt[:, 2] > -10, 3]
     assert 0.1 < len(tilt) / 300 < 0.3
     np.testing.assert_allclose(np.abs(tilt), 0.45 * t, atol=1e-6)
+    assert t == 0 or 0.2 < (tilt > 0).mean() < 0.8, "up and down"
 
 
 @pytest.mark.parametrize("task", SKILLS)
@@ -252,7 +259,10 @@ def test_an_episode_starts_with_its_distance_and_a_heading_near_the_goal(started
     assert np.abs(state.task.shift).max() <= 0.075 and np.all(np.ptp(np.asarray(state.task.shift), axis=0) > 0.1)
     one = jax.tree.map(lambda x: x[0], state)
     motion = env.motion(one.physics)
+    assert 0 < np.mean(state.task.rough) < 0.5, "some episodes are on rough ground"
     xy = env.grid(parkour.HEIGHT_GRID, motion, one.task)
+    still = env.grid(parkour.HEIGHT_GRID, motion, one.task.replace(shift=jnp.zeros(3)))
+    np.testing.assert_allclose(xy - still, np.broadcast_to(one.task.shift[:2], xy.shape), atol=1e-6)
     seen = motion.base_pos[2] - env.ground_height(motion, xy) - 0.5 + one.task.shift[2]
     noise = np.asarray(one.obs[env.obs_slices()["height"]] / 2 - seen)[np.abs(seen) < 0.9]
     assert np.abs(noise).max() <= 0.0501 and noise.min() < -0.04 and noise.max() > 0.04

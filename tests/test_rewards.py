@@ -356,6 +356,28 @@ def test_every_kind_of_task_has_a_case():
     assert robust and CASES.keys() & envs.EXPLORE.keys() and CASES.keys() - robust <= kinds.keys() | envs.EXPLORE.keys()
 
 
+ENDS = {  # bodies that must not touch the ground, besides the feet all that there are for G1
+    "go1_loco": ["base"],
+    "anymal_loco": ["base"],
+    "g1_loco": ["torso", "pelvis"]
+    + [f"{side}_{part}" for side in ("left", "right") for part in ("thigh", "shin", "upperarm", "forearm", "hand")],
+}
+
+
+@pytest.mark.parametrize("task", ENDS)
+def test_any_of_these_bodies_on_the_ground_is_a_failure(task, jitted):
+    """Upright, with 5 N or 3% of the weight at one body after the other; feet may stand."""
+    env, p = jitted(task).env, jitted(task).start(ROBOTS).physics
+    up = env.motion(jax.tree.map(lambda x: x[0], p)).replace(gravity=jnp.array([0.0, 0, -1]))
+    silent = up.replace(sensors=jnp.zeros_like(up.sensors))
+    forces = [env.model.sensor(i).name for i in range(env.model.nsensor) if env.model.sensor(i).name.endswith("_force")]
+    assert {f"{part}_force" for part in ENDS[task]} < {*forces} and not env.failed(None, silent)
+    for name in forces:
+        at = env.model.sensor(name).adr[0] + 2
+        touching = silent.replace(sensors=silent.sensors.at[at].set(0.03 * 9.81 * float(env.model.body_mass.sum())))
+        assert bool(env.failed(None, touching)) == (name.removesuffix("_force") in ENDS[task]), name
+
+
 def test_a_failure_in_the_last_step_is_no_time_limit(jitted):
     """One robot lies on its back, others stand, when their time is up: their returns alone go on."""
     task = jitted("go1_loco")

@@ -341,6 +341,18 @@ def full(*_):
     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
+def test_a_robot_gets_the_gains_of_the_training(untrained, tmp_path, monkeypatch):
+    """Metadata of the exported file: Go1's motors as assets/README.md and its makers have them."""
+    told, helper = {}, types.SimpleNamespace(set_model_props=lambda _, facts: told.update(facts))
+    monkeypatch.setitem(sys.modules, "onnx", types.SimpleNamespace(helper=helper))
+    play.main(dataclasses.replace(untrained, export=str(tmp_path / "go1.onnx")))
+    facts = {name: json.loads(text) for name, text in told.items()}
+    assert (facts["kp"], facts["kd"]) == ([35.0] * 12, [0.5] * 12)
+    np.testing.assert_allclose(facts["torque_limit"], [23.7, 23.7, 35.55] * 4)
+    np.testing.assert_allclose(facts["default_pose"], [0, 0.9, -1.8] * 4, rtol=1e-6)
+    assert facts["history"] == 5 and facts["action_scale"] == [0.25] * 12 and facts["dt"] == 0.02
+
+
 def test_a_disk_that_fills_up_leaves_the_old_file(tmp_path, monkeypatch):
     path = tmp_path / "curve.png"
     path.write_bytes(b"old")
