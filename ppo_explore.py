@@ -570,7 +570,7 @@ def explore(args):
             run.log(state.iteration, [report])
             if not checkpoints.finite((state.params, state.ensemble)):
                 raise records.UserError(
-                    f"weights are not finite after iteration {run.iteration}; lower --lr or --ensemble-lr"
+                    f"weights are not finite after iteration {run.iteration}; lower --max-lr, --lr or --ensemble-lr"
                 )
             if run.due or run.stopped:
                 dataset.flush(arrays)  # before the state that records how far they are filled

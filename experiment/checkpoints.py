@@ -123,6 +123,8 @@ def load_state(folder, like):
         same &= all(x.shape == w.shape and x.dtype == w.dtype for x, w in zip(leaves, wanted, strict=False))
     except OSError as error:
         raise records.UserError(f"cannot resume from {path}: {error.strerror}") from None
+    except (MemoryError, jax.errors.JaxRuntimeError):
+        raise
     except Exception:  # msgpack has no common error class; whatever it says, the file is not ours
         raise records.UserError(f"{path} is damaged; start the run again with --force") from None
     if not same:

@@ -57,6 +57,8 @@ def open_arrays(folder, args, env, iterations):
         try:
             arrays[name] = np.load(path, mmap_mode="r+", allow_pickle=False)
             intact = arrays[name].shape == shape and arrays[name].dtype == KINDS[name][0]
+        except PermissionError as error:
+            raise records.UserError(f"cannot write {path}: {error.strerror}") from None
         except (OSError, ValueError, EOFError):
             intact = False
         if not intact:
@@ -106,10 +108,12 @@ def read_meta(folder):
         intact = intact and all(type(env) is int and 0 <= env < meta["num_envs"] for env in held_out)
         intact = intact and {"layout", "transitions", "args", "versions"} <= meta.keys()
         intact = intact and isinstance(meta["robot"], str)
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         what = "an unfinished collection (no meta.json)" if Path(folder).is_dir() else "not a folder"
         raise records.UserError(f"{folder} is {what}; run ppo_explore.py first") from None
-    except (OSError, ValueError, KeyError, TypeError):
+    except OSError as error:
+        raise records.UserError(f"cannot read {path}: {error.strerror}") from None
+    except (ValueError, KeyError, TypeError):
         intact = False
     if not intact:
         raise records.UserError(f"{path} is damaged; collect the data again")

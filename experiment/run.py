@@ -128,8 +128,8 @@ class Run:
                 self.rows = [rows[:-1] for rows in self.rows]
                 self.save(unstack(before))
                 raise records.UserError(
-                    f"weights are not finite after iteration {self.iteration}; lower --lr. To see what happened: "
-                    f"python tools/replay.py {args.run_dir}"
+                    f"weights are not finite after iteration {self.iteration}; lower --max-lr or --lr. "
+                    f"To see what happened: python tools/replay.py {args.run_dir}"
                 )
             if folder:
                 meta = {"task": args.task, "args": dataclasses.asdict(args), "body": self.body}

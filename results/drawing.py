@@ -193,13 +193,13 @@ def draw_success(study, path):
     return True
 
 
-def draw_sizes(study, path, errors):
+def draw_sizes(study, path, errors, shipped):
     """Paper Sec. V-D: error of the PIDM (transitions -> rad) and, of tasks that were run with several sizes, iterations
-    to converge, over its training set.
+    to converge, over its training set; that of the shipped PIDM has so many transitions.
     """
     if len(errors) < 2:
         return False
-    methods = {7_000: "pidm_7k", 70_000: "pidm_70k", 700_000: "pidm_700k", max(errors): "pidm_pretrained"}
+    methods = {7_000: "pidm_7k", 70_000: "pidm_70k", 700_000: "pidm_700k", shipped: "pidm_pretrained"}
     found = {
         task: {count: measures.compare(task, runs, method, "to 90%") for count, method in methods.items()}
         for task, runs in study.items()
@@ -222,12 +222,13 @@ def draw_sizes(study, path, errors):
 
 def curves_by_scale(loaded):
     """Title -> runs of the walking quadrupeds that were run at several scales."""
-    return {
-        f"{titled(task, runs)}{', unscaled' * is_unscaled(scale)}": runs
-        for task in WALKING
-        for scale, runs in by_scale(loaded, task).items()
-        if len(by_scale(loaded, task)) > 1
-    }
+    found = {}
+    for task in WALKING:
+        scales = by_scale(loaded, task)
+        for scale, runs in scales.items() if len(scales) > 1 else ():
+            title = f"{titled(task, runs)}{', unscaled' * is_unscaled(scale)}"
+            found[f"{title}, {scale}" if title in found else title] = runs
+    return found
 
 
 CRITIC = {

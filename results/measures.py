@@ -63,14 +63,14 @@ class Estimate:
 
 def final(run):
     """Mean indicator of the last 5% of rows."""
-    return run["indicator"][-max(len(run["indicator"]) // 20, 1) :].mean()
+    return np.nanmean(run["indicator"][-max(len(run["indicator"]) // 20, 1) :])
 
 
 def late_gain(run):
     """Share of the final performance gained in the last third of the training: near 0 once the curve is flat."""
     rows = len(run["indicator"])
     end, width = max(2 * rows // 3, 1), max(rows // 20, 1)
-    return 1 - run["indicator"][end - width : end].mean() / final(run)
+    return 1 - np.nanmean(run["indicator"][end - width : end]) / final(run)
 
 
 def area(run):

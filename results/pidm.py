@@ -17,6 +17,7 @@ import sys
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Literal
 
 import flax.linen as nn
@@ -61,10 +62,14 @@ def copy(source, target):
 
 
 def keep(robot):
-    """Copy the small files of both stages, and the weights."""
+    """Copy the small files of both stages, and the weights. UserError if the training was stopped before its end."""
     folder, explored, trained = (
         ROOT / path for path in (f"results/pidm/{robot}", f"runs/explore/{robot}/seed0", f"runs/pidm/{robot}/seed0")
     )
+    errors = [row["error"] for row in records.read_rows(trained / "metrics.csv")]
+    settings = SimpleNamespace(**json.loads((trained / "args.json").read_text()))
+    if len(errors) < pretrain_pidm.decay(settings, errors)[1]:
+        raise records.UserError(f"{trained} was stopped after {len(errors)} epochs; the shipped PIDM stays as it is")
     for name in ("meta.json", "metrics.csv", "curve.png"):
         copy(explored / name, folder / "explore" / name)
     for name in ("args.json", "metrics.csv", "validation.json", "curve.png", "accuracy.png", "distribution.png"):
@@ -295,7 +300,7 @@ def draw_coverage(points, title, path, gridsize=30):
 
 HEAD = """# Shipped PIDM checkpoints
 
-The commands that stand below for each robot made them (anymal_d's with uncommitted changes). Now `python
+The commands that stand below for each robot made them{dirty}. Now `python
 results/pidm.py` collects 7.6 M transitions and trains until the error is flat, 100 epochs at most.
 
 Errors are on held-out environments, with the tasks' sensor noise. error_over_change is error_rad over the mean action
@@ -327,7 +332,7 @@ def commands(robot, explored, trained):
 
 def write_readme():
     """Write results/pidm/README.md from the kept files of all robots."""
-    lines, first = [], []
+    lines, first, dirty = [], [], []
     for folder in sorted(path.parent for path in (ROOT / "results/pidm").glob("*/validation.json")):
         meta, result = (json.loads((folder / name).read_text()) for name in ("explore/meta.json", "validation.json"))
         for extra in (folder / "coverage.json", folder / "features.json"):
@@ -336,8 +341,9 @@ def write_readme():
         rows = records.read_rows(folder / "metrics.csv")
         lines += [f"## {folder.name}", "", f"{meta['transitions']:,} transitions, {len(rows)} epochs.", ""]
         lines += [*commands(folder.name, meta["args"], trained), ""]
-        if all(abs(row["error"] - result["error"]) > 1e-4 * result["error"] for row in rows):  # not of the training
-            first.append(folder.name)
+        best = min(row["error"] for row in rows)  # on 50,000 transitions of the training's collection
+        first += [folder.name] if abs(best - result["error"]) > 0.01 * result["error"] else []
+        dirty += [folder.name] if trained["versions"]["commit"].endswith("-dirty") else []
         lines += [
             "| what | figure |",
             "|---|---|",
@@ -347,7 +353,8 @@ def write_readme():
         pictures = ("curve", "accuracy", "distribution", "coverage", "novelty", "explore/curve")
         drawn = [name for name in pictures if (folder / f"{name}.png").exists()]
         lines += [*(f"![{name}]({folder.name}/{name}.png)" for name in drawn), ""]
-    head = HEAD + (FIRST.format(robots=", ".join(first)) if first else "")
+    changed = f" ({', '.join(dirty)}'s with uncommitted changes)" if dirty else ""
+    head = HEAD.replace("{dirty}", changed) + (FIRST.format(robots=", ".join(first)) if first else "")
     records.replace_text(ROOT / "results/pidm/README.md", head + "\n".join(lines).rstrip() + "\n")
 
 

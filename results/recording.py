@@ -1,5 +1,6 @@
-"""Train a task, evaluate its policy and copy the run's small files, for tasks.py and study.py."""
+"""Run a script, see how far its training got, evaluate the policy and copy the small files of a run."""
 
+import json
 import signal
 import subprocess
 import sys
@@ -29,6 +30,16 @@ def run_script(words, log=None, seconds=None):
         where = f"; see {log.name}" if log else ""
         raise records.UserError(f"{' '.join(words)} ended with exit code {code}{where}")
     return True
+
+
+def share(run):
+    """Share of its steps that the training runs/<run> has made, None before its first row."""
+    folder = ROOT / "runs" / run
+    try:
+        total = json.loads((folder / "args.json").read_text())["total_steps"]
+        return records.read_rows(folder / "metrics.csv")[-1]["env_steps"] / total
+    except (OSError, ValueError, KeyError, IndexError, TypeError):
+        return None
 
 
 def evaluate(run, folder, names, log=None):

@@ -30,6 +30,7 @@ from results.grid import CONTROLS, METHODS, SCALES, TABLE_1, TASKS, task_of, tit
 
 STUDY = ROOT / "results/study"
 PARTS = ROOT / "results/pidm_large"  # PIDMs of the whole collection and of parts of it
+SHIPPED = ROOT / "results/pidm/anymal_d/metrics.csv"  # of the PIDM that the study loads
 
 
 @dataclass(frozen=True)
@@ -64,7 +65,9 @@ MARKED = re.compile(r"(<!-- results/report\.py writes ?([\w -]*?) ?from here -->
 
 def load_study():
     """Runs of each scale and task that has any: scale -> task -> method -> runs."""
-    loaded = {scale: {task: tables.load_task(STUDY / scale / task) for task in TASKS} for scale in SCALES}
+    loaded = {
+        scale: {task: tables.load_task(STUDY / scale / task) for task in TASKS} for scale in SCALES if scale != "smoke"
+    }
     found = {scale: {task: runs for task, runs in study.items() if runs} for scale, study in loaded.items()}
     return {scale: study for scale, study in found.items() if study}
 
@@ -85,7 +88,7 @@ def pick(loaded, methods=TABLE_1):
 def readme_table(study):
     """Rows of Table I that have runs, for the project's README."""
     ran = [task for task in TASKS if "pidm_random" in study.get(task, {})]
-    missing = ", ".join(f"`{task}`" for task in TASKS if task not in ran)
+    missing = ", ".join(f"`{task}`" for task in TASKS if not {*TABLE_1} <= study.get(task, {}).keys())
     lines = tables.table_1(study, ran) if ran else []
     return lines + (["", f"Not all methods run yet: {missing}."] if missing else [])
 
@@ -156,7 +159,9 @@ def draw_all(loaded):
         "critics": lambda path: drawing.draw_critics(loaded.get("batch", {}), path),
         "updates": lambda path: drawing.draw_updates(study, path),
         "success": lambda path: drawing.draw_success(study, path),
-        "sizes": lambda path: drawing.draw_sizes(pick(loaded, titles("sizes")), path, tables.sizes_of(PARTS)),
+        "sizes": lambda path: drawing.draw_sizes(
+            pick(loaded, titles("sizes")), path, tables.sizes_of(PARTS), tables.transitions(SHIPPED)
+        ),
         "batch": lambda path: drawing.draw_batch(loaded, path),
     }
     for name, draw in drawn.items():

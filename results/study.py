@@ -11,7 +11,6 @@ A run is in runs/study/<scale>/<task>/<method>/seed<k>. Its small files are kept
 report.py reads them. Scales never mix.
 """
 
-import json
 import sys
 import time
 from dataclasses import dataclass
@@ -74,14 +73,7 @@ class Cell:
 
     def share(self):
         """Share of its steps that the run has made, None before its first row."""
-        run = ROOT / "runs" / self.folder
-        try:
-            return (
-                records.read_rows(run / "metrics.csv")[-1]["env_steps"]
-                / json.loads((run / "args.json").read_text())["total_steps"]
-            )
-        except (OSError, ValueError, KeyError, IndexError, TypeError):
-            return None
+        return recording.share(self.folder)
 
     def lacks(self):
         """The PIDM that the run would start from, if it is not there."""
@@ -144,6 +136,23 @@ def run(cell, seconds):
     return True
 
 
+def train(cells, seconds):
+    """Make these runs, one after the other, for at most `seconds`. UserError at the end if some failed."""
+    start, failed = time.perf_counter(), []
+    for cell in cells:
+        left = seconds - (time.perf_counter() - start)
+        try:
+            if left <= 0 or not run(cell, left):
+                print("out of time, or stopped; the same command goes on")
+                break
+            print(f"ran {cell.folder}  {(time.perf_counter() - start) / 60:.1f} min", flush=True)
+        except records.UserError as error:  # the other runs may do better
+            failed.append(cell.folder)
+            print(f"error: {error}", file=sys.stderr)
+    if failed:
+        raise records.UserError(f"{len(failed)} failed; to start one anew, remove runs/{failed[0]}")
+
+
 def main(args):
     """Train what is missing, or list it."""
     runs = planned(args)
@@ -151,20 +160,19 @@ def main(args):
         return show_status(runs)
     missing = [cell for cells in runs.values() for cell in cells if not cell.done()]
     if not missing:
-        words = "all of these runs are recorded under results/study; to repeat one, first move its folder away"
+        words = (
+            "all of these runs are recorded; to repeat one, first move its folders under runs/study and results/study "
+        )
+        words += "away, out of the folder of its method"
         print(words, file=sys.stderr)  # what --list prints is run
     for path in dict.fromkeys(filter(None, (cell.lacks() for cell in missing))):
         print(f"left out: runs from {path}, which is missing; results/pidm.py makes it", file=sys.stderr)
-    start = time.perf_counter()
-    for cell in [cell for cell in missing if not cell.lacks()]:
-        left = 60 * args.budget_minutes - (time.perf_counter() - start)
-        if args.list:
-            words = f"--tasks {cell.task} --methods {cell.method} --seeds {cell.seed} --scales {cell.scale}"
-            print(f"python results/study.py {words}")
-        elif left <= 0 or not run(cell, left):
-            return print("out of time, or stopped; the same command goes on")
-        else:
-            print(f"ran {cell.folder}  {(time.perf_counter() - start) / 60:.1f} min", flush=True)
+    cells = [cell for cell in missing if not cell.lacks()]
+    if not args.list:
+        return train(cells, 60 * args.budget_minutes)
+    for cell in cells:
+        words = f"--tasks {cell.task} --methods {cell.method} --seeds {cell.seed} --scales {cell.scale}"
+        print(f"python results/study.py {words}")
     return None
 
 

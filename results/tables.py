@@ -96,7 +96,7 @@ def load_run(folder, evaluated=True):
             "gait": result.get("gait", {}),
             "success": list(success.values()),
             "settings": {key: record[key] for key in keys}
-            | {"config": task_of(record["config"]), "levels": list(success), "indicator": indicator},
+            | {"config": task_of(record["config"]), "levels": list(success), "indicator": indicator, "rows": len(rows)},
             "seed": record["seed"],
             "earlier": is_earlier(*folder.parts[-4:-2]),
             "versions": record["versions"],
@@ -110,7 +110,7 @@ def load_task(folder, evaluated=True):
     """Runs of each method, by seed. Runs whose settings differ from the first one's are left out with a warning."""
     runs, settings = {}, None
     for method in METHODS:
-        for seed in sorted((folder / method).glob("seed*")):
+        for seed in sorted(path for path in (folder / method).glob("seed*") if path.name[4:].isdigit()):
             run = load_run(seed, evaluated)
             if run is None:
                 continue
@@ -440,6 +440,10 @@ def sizes_of(folder):
     found = {}
     for path in [*folder.glob("sizes/*_validation.json"), folder / "validation.json"]:
         stem = path.stem.removesuffix("validation")
-        count = int(records.read_rows(path.with_name(f"{stem}metrics.csv"))[0]["samples"])  # of the first epoch
-        found[count] = json.loads(path.read_text())["error_rad"]
+        found[transitions(path.with_name(f"{stem}metrics.csv"))] = json.loads(path.read_text())["error_rad"]
     return dict(sorted(found.items()))
+
+
+def transitions(path):
+    """Number of transitions that a PIDM was trained on, from its metrics.csv: the samples of the first epoch."""
+    return int(records.read_rows(path)[0]["samples"])

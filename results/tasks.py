@@ -60,6 +60,8 @@ def main(args):
         if "train" in args.stages:
             words = ["--task", task, "--preset", args.preset, "--run-dir", f"runs/{run}", "--force"]
             recording.run_script(["ppo_finetune.py", *words])
+            if (recording.share(run) or 0) < 1:
+                raise records.UserError(f"runs/{run} was stopped before its end; {folder} stays as it is")
         if "look" in args.stages:
             recording.evaluate(run, folder, KEPT)
             if envs.TASKS[task][0].LEVELS:

@@ -34,6 +34,11 @@ def test_final_is_the_mean_of_the_last_twentieth():
     assert measures.final(curve([1.0, 2.0])) == 2.0
 
 
+def test_a_row_in_which_no_episode_ended_does_not_count():
+    assert measures.final(curve([*[0.0] * 38, 4.0, np.nan])) == 4.0
+    assert measures.late_gain(curve([*[1.0] * 20, *[8.0] * 19, np.nan, *[10.0] * 20])) == pytest.approx(0.2)
+
+
 def test_late_gain_is_what_the_last_third_brought():
     assert measures.late_gain(curve([*[1.0] * 20, *[8.0] * 20, *[10.0] * 20])) == pytest.approx(0.2)
     assert measures.late_gain(curve([3.0])) == 0.0
@@ -819,10 +824,18 @@ def study(tmp_path):
 def test_bad_runs_are_left_out_with_a_warning(study, capsys):
     folder, args = study
     assert set(tables.load_task(folder)) == {"mlp", "pidm_random"} and not capsys.readouterr().err
+    shutil.copytree(folder / "mlp/seed0", folder / "mlp/seed0.old")
+    assert len(tables.load_task(folder)["mlp"]) == 1, "put away, not another seed"
     target = folder / "pidm_random/seed0"
     (target / "args.json").write_text(json.dumps(args | {"lr": 2.0}))
     assert set(tables.load_task(folder)) == {"mlp"}
     assert "other settings" in capsys.readouterr().err
+    (target / "args.json").write_text(json.dumps(args))
+    half = (target / "metrics.csv").read_text().splitlines()
+    (target / "metrics.csv").write_text("\n".join([half[0], *half[2::2]]) + "\n")
+    assert set(tables.load_task(folder)) == {"mlp"}
+    assert "other settings" in capsys.readouterr().err, "rows of other iterations have no mean curve"
+    (target / "metrics.csv").write_text("\n".join(half) + "\n")
     (target / "args.json").write_text(json.dumps(args | {"total_steps": 50}))
     assert set(tables.load_task(folder)) == {"mlp"}
     assert "stopped before its last step" in capsys.readouterr().err
@@ -883,8 +896,8 @@ def test_sizes_are_those_that_were_pretrained_on(tmp_path, monkeypatch):
     assert tables.sizes_of(folder) == {7000: 0.9, 70000: 0.6, 920000: 0.3}
     run = {"pidm_random": flat(10.0, 11.0), "pidm_7k": flat(9.0, 9.5), "pidm_pretrained": flat(12.0, 13.0)}
     study = {"anymal_climb_up": run, "anymal_climb_down": run}
-    assert drawing.draw_sizes(study, tmp_path / "sizes.png", tables.sizes_of(folder))
-    assert drawing.draw_sizes({}, tmp_path / "errors.png", tables.sizes_of(folder))
+    assert drawing.draw_sizes(study, tmp_path / "sizes.png", tables.sizes_of(folder), 920000)
+    assert drawing.draw_sizes({}, tmp_path / "errors.png", tables.sizes_of(folder), 920000)
     both, errors = (matplotlib.image.imread(tmp_path / f"{name}.png").shape[1] for name in ("sizes", "errors"))
     assert both == 2 * errors  # no empty panel where no task was run with them
     lines = report.sizes(study, report.titles("sizes"), tuple(study))

@@ -11,7 +11,7 @@ import envs
 import play
 import ppo_finetune
 from experiment import records
-from results import grid, recording, report, study
+from results import grid, recording, report, study, tasks
 
 SKILLS = tuple(task for task, (_, config) in envs.TASKS.items() if hasattr(config, "skill"))
 FREE = {"run_dir", "save_minutes", "shuffle_blocks"}  # arguments that may differ from those of a recorded run
@@ -22,6 +22,7 @@ WIDTHS = {"hidden", "intention"}  # likewise in parkour's earlier tasks, whose M
 def runs(tmp_path, monkeypatch):
     """A study in an empty folder, with a stand-in for the training that writes half of a run, and then the rest."""
     monkeypatch.setattr(study, "ROOT", tmp_path)
+    monkeypatch.setattr(study.recording, "ROOT", tmp_path)
     calls = []
 
     def run_script(words, log, seconds):
@@ -89,6 +90,34 @@ def test_a_training_that_was_asked_to_stop_is_not_kept(runs, monkeypatch):
     (folder / "args.json").write_text('{"total_steps": 100}')
     (folder / "metrics.csv").write_text("env_steps\n50\n")
     assert not study.run(cell, 1.0) and not cell.done() and cell.share() == 0.5
+
+
+def test_a_task_whose_training_was_stopped_keeps_its_record(runs, monkeypatch):
+    monkeypatch.setattr(tasks.recording, "run_script", lambda *words: True)
+    folder = study.ROOT / "runs/tasks/go1_loco"
+    folder.mkdir(parents=True)
+    (folder / "args.json").write_text('{"total_steps": 100}')
+    (folder / "metrics.csv").write_text("env_steps\n50\n")
+    with pytest.raises(records.UserError, match="runs/tasks/go1_loco was stopped"):
+        tasks.main(tasks.Args(tasks=("go1_loco",)))
+
+
+def test_a_run_that_fails_does_not_keep_the_others_from_running(runs, monkeypatch, capsys):
+    """Its own error comes at once, and again at the end, with exit code 2 from there."""
+    whole = study.recording.run_script
+
+    def fails_first(words, log, seconds):
+        if "pidm_shuffled" in words[-2]:
+            raise records.UserError("weights are not finite")
+        return whole(words, log, seconds) or True
+
+    monkeypatch.setattr(study.recording, "run_script", fails_first)
+    args = study.Args(tasks=("go1_loco",), methods=("pidm_shuffled", "pidm_random_orthogonal"), seeds=(2,))
+    runs.append("the first stand-in is interrupted")
+    with pytest.raises(records.UserError, match=r"1 failed; .*remove runs/study/batch/go1_loco/pidm_shuffled/seed2"):
+        study.main(args)
+    assert "weights are not finite" in capsys.readouterr().err
+    assert study.Cell("batch", "go1_loco", "pidm_random_orthogonal", 2).done()
 
 
 def test_no_run_starts_when_time_is_over(runs, capsys):
