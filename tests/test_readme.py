@@ -271,7 +271,8 @@ def test_demo_is_what_was_recorded():
     minutes = float(last_row(ROOT / "results/tasks/demo")["seconds"]) / 60
     text = " ".join(README.split())
     assert f"training took {minutes:.1f} minutes" in text
-    assert f"to {result['lin_vel_error']:.2f} m/s with {100 * result['falls']:.0f}% falls" in text
+    assert f"to {result['lin_vel_error']:.2f} m/s with {100 * result['falls']:.0f}% falls, in six short" in text
+    assert round(read("tasks/demo", "eval.json")["gait"]["stride_frequency"]) == 6
 
 
 def test_main_use_is_what_was_recorded():
