@@ -23,7 +23,7 @@ import numpy as np
 import optax
 import tyro
 
-from envs.base import NOISE, PROP
+from envs import base, label
 from experiment import arguments, checkpoints, dataset, devices, figures, metrics, records
 from experiment.run import Run
 
@@ -207,7 +207,7 @@ def batches(data, index, size):
 
 def noise_width(env):
     """Half-width (X,) of the tasks' sensor noise, for every entry of x."""
-    return jnp.concatenate([jnp.full(env.width(PROP[name]), NOISE[name]) for name in env.prop_layout])
+    return jnp.concatenate([jnp.full(env.width(base.PROP[name]), base.NOISE[name]) for name in env.prop_layout])
 
 
 def add_noise(key, width, batch):
@@ -329,7 +329,7 @@ def init_variables(args, env, net, windows):
 def pretrain(args):
     """Train, keep the weights of the best epoch, and validate them."""
     data, env = open_data(args)
-    args = merge(args, env.robot.name)
+    args = merge(args, label(env.config.body or env.robot.name))
     count = len(data.train) if args.num_samples is None else args.num_samples
     if not (least := jax.device_count()) <= count <= len(data.train):
         raise records.UserError(f"--num-samples {count} is not from {least} to the {len(data.train)} in {args.data}")

@@ -45,12 +45,12 @@ def body_of(robot):
 
 
 def label(task, robot=None):
-    """Name of a task for folders, after that of the robot if it has a file; or of a robot, by its name or file."""
+    """Name of a task for folders, after that of a robot from a file; or of a robot, by its name, file or body."""
     if robot:
         return f"{label(robot)}_{task}"
-    if not Path(task).suffix:
+    if isinstance(task, str) and not Path(task).suffix:
         return task
-    name = loader.name_of(Path(task))
+    name = task["name"] if isinstance(task, dict) else loader.name_of(Path(task))
     return f"{name}_file" if name in EXPLORE else name  # not in the folders of the shipped robot
 
 

@@ -558,6 +558,7 @@ def test_folders_have_the_name_of_the_robot(write, tmp_path):
     assert (envs.label("go1_loco"), envs.label("go1")) == ("go1_loco", "go1")
     theirs = str(write(quadruped(), name="go1.xml"))
     assert (envs.label("loco", theirs), envs.label(theirs)) == ("go1_file_loco", "go1_file"), "not the shipped Go1's"
+    assert envs.label(loader.load(theirs)) == "go1_file"
 
 
 def test_wrong_pairs_of_flags(refused, write):
