@@ -462,6 +462,8 @@ def test_words_on_levels_are_what_was_recorded():
     crouch = [last("batch/anymal_crouch", m) for m in ("mlp", "pidm_pretrained", "pidm_random")]
     assert "the MLP gets under a table of 0.4 m in {}, the pretrained PIDM in {}, the random".format(*crouch) in text
     assert crouch[2] == "0%" and "the random one in none." in text
+    walk = [last("batch/anymal_parkour_walk", m) for m in ("pidm_pretrained", "pidm_random", "mlp")]
+    assert "passes the last level in {}, the random one in {}, the MLP in {}.".format(*walk) in text
     jump = [last("cpu/anymal_jump", m) for m in ("pidm_pretrained", "pidm_random")]
     assert "gets over 1 m in {}, the random one in {};".format(*jump) in text
 
