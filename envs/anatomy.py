@@ -227,13 +227,8 @@ def differences(model, data, reflection, b, other):
     }
 
 
-MOTOR = {
-    "kp": 0.02,
-    "torque_limit": 0.02,
-    "action_scale": 0.02,
-    "kd": 0.1,
-    "armature": 0.1,
-}  # -> by how much images may differ
+# Share by which these may differ in a joint and its image. Damping and rotors follow from inertias, never quite equal.
+MOTOR = {"kp": 0.02, "torque_limit": 0.02, "action_scale": 0.02, "kd": 0.1, "armature": 0.1}
 
 
 def joint_images(model, data, reflection, images, body):

@@ -226,8 +226,8 @@ def curves_by_scale(loaded):
     for task in WALKING:
         scales = by_scale(loaded, task)
         for scale, runs in scales.items() if len(scales) > 1 else ():
-            title = f"{titled(task, runs)}{', unscaled' * is_unscaled(scale)}"
-            found[f"{title}, {scale}" if title in found else title] = runs
+            key = f"{titled(task, runs)}{', unscaled' * is_unscaled(scale)}"
+            found[f"{key}, {scale}" if key in found else key] = runs
     return found
 
 

@@ -354,7 +354,7 @@ def write_readme():
         drawn = [name for name in pictures if (folder / f"{name}.png").exists()]
         lines += [*(f"![{name}]({folder.name}/{name}.png)" for name in drawn), ""]
     changed = f" ({', '.join(dirty)}'s with uncommitted changes)" if dirty else ""
-    head = HEAD.replace("{dirty}", changed) + (FIRST.format(robots=", ".join(first)) if first else "")
+    head = HEAD.format(dirty=changed) + (FIRST.format(robots=", ".join(first)) if first else "")
     records.replace_text(ROOT / "results/pidm/README.md", head + "\n".join(lines).rstrip() + "\n")
 
 

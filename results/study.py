@@ -160,11 +160,8 @@ def main(args):
         return show_status(runs)
     missing = [cell for cells in runs.values() for cell in cells if not cell.done()]
     if not missing:
-        words = (
-            "all of these runs are recorded; to repeat one, first move its folders under runs/study and results/study "
-        )
-        words += "away, out of the folder of its method"
-        print(words, file=sys.stderr)  # what --list prints is run
+        words = "all of these runs are recorded; to repeat one, first move its folders out of that of its method, "
+        print(words + "under runs/study and results/study", file=sys.stderr)  # what --list prints is run
     for path in dict.fromkeys(filter(None, (cell.lacks() for cell in missing))):
         print(f"left out: runs from {path}, which is missing; results/pidm.py makes it", file=sys.stderr)
     cells = [cell for cell in missing if not cell.lacks()]
